@@ -1,0 +1,224 @@
+"""Actor and critic as TensorDict modules for TorchRL (Yuan & Kitani 2019, section 3.1).
+
+Both are an MLP (300, 200) on the humanoid's state and the visual context; they share nothing. The context either comes
+with the observation (frozen, from the state regressor) or from a recurrent network of the module's own, trained by PPO.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields
+from typing import Any
+
+import torch
+from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequential
+from torch import Tensor, nn
+from torchrl.envs.utils import ExplorationType
+from torchrl.modules import MLP, IndependentNormal, ProbabilisticActor, ValueOperator
+
+from egopose.errors import InputError
+from egopose.models.context import BidirectionalContext
+from egopose.models.episode_context import EpisodeContext, episode_context_module
+
+_log = logging.getLogger(__name__)
+
+_ACTIVATIONS: dict[str, type[nn.Module]] = {"relu": nn.ReLU, "tanh": nn.Tanh, "elu": nn.ELU, "silu": nn.SiLU}
+
+
+@dataclass(frozen=True)
+class ContextSettings:
+    """``source``: ``frozen`` (``visual_context`` is in the observation) or ``trainable`` (own BiLSTM); the window's
+    frames and the units a direction are read only by ``trainable``."""
+
+    source: str
+    hidden_size: int
+    horizon: int
+    padding: int
+
+
+@dataclass(frozen=True)
+class CriticSettings:
+    """``privileged``: observation keys only the critic reads (asymmetric actor-critic)."""
+
+    hidden: tuple[int, ...]
+    privileged: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class PolicySettings:
+    """The group ``conf/model``.
+
+    Args:
+        hidden: widths of the actor's hidden layers.
+        activation: ``relu``, ``tanh``, ``elu`` or ``silu``.
+        sigma: standard deviation of each action, rad; where it is learned, its start.
+        learn_sigma: one trained log-sigma an action.
+        final_gain: gain of the orthogonal start of the actor's last layer.
+        context: see :class:`ContextSettings`.
+        critic: see :class:`CriticSettings`.
+    """
+
+    hidden: tuple[int, ...]
+    activation: str
+    sigma: float
+    learn_sigma: bool
+    final_gain: float
+    context: ContextSettings
+    critic: CriticSettings
+
+    @classmethod
+    def from_config(cls, config: Mapping[str, Any]) -> PolicySettings:
+        """From the resolved config group. Raises InputError naming the setting that is missing, unknown or wrong."""
+        top = _exactly(cls, config, "model")
+        context = ContextSettings(**_exactly(ContextSettings, top["context"], "model.context"))
+        critic = _exactly(CriticSettings, top["critic"], "model.critic")
+        if context.source not in ("frozen", "trainable"):
+            raise InputError("model", "context.source", f"must be frozen or trainable, not {context.source!r}")
+        if top["activation"] not in _ACTIVATIONS:
+            raise InputError("model", "activation", f"must be one of {', '.join(_ACTIVATIONS)}")
+        if not top["sigma"] > 0:
+            raise InputError("model", "sigma", f"must be positive, not {top['sigma']}")
+        return cls(
+            **{
+                **top,
+                "hidden": tuple(top["hidden"]),
+                "context": context,
+                "critic": CriticSettings(tuple(critic["hidden"]), tuple(critic["privileged"])),
+            }
+        )
+
+
+def _exactly(settings: type, config: Mapping[str, Any], source: str) -> dict[str, Any]:
+    """``config`` as keyword arguments of a settings class, no more and no fewer."""
+    wanted = {f.name for f in fields(settings)}
+    for name in sorted(wanted ^ set(config)):
+        raise InputError(source, str(name), "is missing" if name in wanted else "is not a setting of this group")
+    return dict(config)
+
+
+class GaussianHead(nn.Module):
+    """MLP to the mean of the action, and a diagonal sigma that does not depend on the state.
+
+    Args:
+        in_features: width of the concatenated inputs.
+        action_size: degrees of freedom driven.
+        settings: of the policy.
+    """
+
+    def __init__(self, in_features: int, action_size: int, settings: PolicySettings) -> None:
+        super().__init__()
+        self.mean = _mlp(in_features, action_size, settings.hidden, settings.activation)
+        last = self.mean[-1]
+        # The start policy is the action's reference pose: any visible offset would make the body fall sooner.
+        nn.init.orthogonal_(last.weight, settings.final_gain)
+        nn.init.zeros_(last.bias)
+        log_sigma = torch.full((action_size,), math.log(settings.sigma))
+        if settings.learn_sigma:
+            self.log_sigma = nn.Parameter(log_sigma)
+        else:
+            self.register_buffer("log_sigma", log_sigma)
+
+    def forward(self, *inputs: Tensor) -> tuple[Tensor, Tensor]:
+        """Inputs ``[..., d_i]`` -> mean ``[..., A]`` and sigma ``[..., A]`` (rad)."""
+        mean = self.mean(*inputs)
+        return mean, self.log_sigma.exp().expand_as(mean)
+
+
+def build_actor(
+    settings: PolicySettings,
+    widths: Mapping[str, int],
+    action_size: int,
+    features_table: Tensor | None = None,
+    take_bounds: Tensor | None = None,
+    state_key: str = "humanoid_state",
+) -> TensorDictModuleBase:
+    """The policy pi(a | z, phi): a diagonal Gaussian, its mean under ``ExplorationType.DETERMINISTIC``.
+
+    Writes ``loc``, ``scale``, ``action`` and ``action_log_prob``.
+
+    Args:
+        settings: of the policy.
+        widths: last dimension of each observation key (``humanoid_state``; ``visual_context`` where it is frozen).
+        action_size: degrees of freedom driven.
+        features_table: ``[F, D]`` visual features, only where the context is trainable.
+        take_bounds: ``[K, 2]`` int64 global frames of the takes, only where the context is trainable.
+        state_key: observation that holds the humanoid's state.
+
+    Raises:
+        InputError: an observation the settings need is not there.
+    """
+    context, context_key, context_width = _context(settings, widths, "visual_context", features_table, take_bounds)
+    head = GaussianHead(_width(widths, state_key, "humanoid_state") + context_width, action_size, settings)
+    module = TensorDictSequential(
+        *context, TensorDictModule(head, in_keys=[state_key, context_key], out_keys=["loc", "scale"])
+    )
+    actor = ProbabilisticActor(
+        module,
+        in_keys=["loc", "scale"],
+        distribution_class=IndependentNormal,
+        return_log_prob=True,
+        default_interaction_type=ExplorationType.RANDOM,
+    )
+    log_parameter_count("actor", actor)
+    return actor
+
+
+def build_critic(
+    settings: PolicySettings,
+    widths: Mapping[str, int],
+    features_table: Tensor | None = None,
+    take_bounds: Tensor | None = None,
+    state_key: str = "humanoid_state",
+) -> TensorDictModuleBase:
+    """The value V(z, phi[, privileged]) -> ``state_value [..., 1]``: a network of its own, with its own context.
+
+    Arguments and errors as :func:`build_actor`. A trainable context is written to ``critic_visual_context``.
+    """
+    context, context_key, context_width = _context(
+        settings, widths, "critic_visual_context", features_table, take_bounds
+    )
+    privileged = settings.critic.privileged
+    in_keys = [state_key, context_key, *privileged]
+    width = _width(widths, state_key, "humanoid_state") + context_width
+    width += sum(_width(widths, key, "critic.privileged") for key in privileged)
+    value = ValueOperator(_mlp(width, 1, settings.critic.hidden, settings.activation), in_keys=in_keys)
+    critic = TensorDictSequential(*context, value)
+    log_parameter_count("critic", critic)
+    return critic
+
+
+def _context(
+    settings: PolicySettings,
+    widths: Mapping[str, int],
+    out_key: str,
+    features_table: Tensor | None,
+    take_bounds: Tensor | None,
+) -> tuple[list[TensorDictModule], str, int]:
+    """Modules that make the context (none where it is frozen), the key it stands under, its width."""
+    if settings.context.source == "frozen":
+        return [], "visual_context", _width(widths, "visual_context", "context.source")
+    if features_table is None or take_bounds is None:
+        raise InputError("model", "context.source", "trainable needs the store's visual features and take bounds")
+    network = BidirectionalContext(features_table.shape[1], settings.context.hidden_size)
+    window = EpisodeContext(features_table, network, take_bounds, settings.context.padding, settings.context.horizon)
+    return [episode_context_module(window, out_key)], out_key, network.output_size
+
+
+def _width(widths: Mapping[str, int], key: str, setting: str) -> int:
+    if key not in widths:
+        raise InputError("model", setting, f"needs the observation {key!r}; there are {', '.join(sorted(widths))}")
+    return int(widths[key])
+
+
+def _mlp(in_features: int, out_features: int, hidden: Sequence[int], activation: str) -> MLP:
+    return MLP(in_features, out_features, num_cells=list(hidden), activation_class=_ACTIVATIONS[activation])
+
+
+def log_parameter_count(label: str, module: nn.Module) -> int:
+    """Logs and returns the number of parameters, with each direct part's share."""
+    parts = {name: sum(p.numel() for p in child.parameters()) for name, child in module.named_children()}
+    total = sum(p.numel() for p in module.parameters())
+    _log.info("%s: %s parameters (%s)", label, f"{total:,}", ", ".join(f"{k} {v:,}" for k, v in parts.items() if v))
+    return total
