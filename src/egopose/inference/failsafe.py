@@ -1,0 +1,72 @@
+"""When to give up on the humanoid's state and restart it from the regressor's (Yuan & Kitani 2019, section 3.3).
+
+Three modes. ``value``: reset when ``V(s_t) < kappa * V_mean``, V_mean the running mean of V over the take so far.
+``naive``: reset when the humanoid has fallen, its head under a height. ``off``: never.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+MODES = ("value", "naive", "off")
+
+
+class FailSafe:
+    """The fail-safe of N worlds that run side by side, one take each.
+
+    Args:
+        worlds: N.
+        mode: one of ``value``, ``naive``, ``off``.
+        kappa: fraction of the mean value under which the state counts as unstable.
+        fallen_height: head height (m) under which the humanoid counts as fallen, for ``naive``.
+
+    Attributes:
+        confidence: list over calls of ``[N]`` float64: V(s_t) over its running mean (1 at the first frame; NaN for
+            worlds that were not active).
+        resets: ``[N]`` int64, how often each world was reset.
+
+    Raises:
+        ValueError: an unknown mode.
+    """
+
+    def __init__(self, worlds: int, mode: str, kappa: float, fallen_height: float) -> None:
+        if mode not in MODES:
+            raise ValueError(f"fail-safe mode {mode!r}; choose from {', '.join(MODES)}")
+        self.mode, self.kappa, self.fallen_height = mode, kappa, fallen_height
+        self.confidence: list[Tensor] = []
+        self.resets = torch.zeros(worlds, dtype=torch.int64)
+        self._sum = torch.zeros(worlds, dtype=torch.float64)
+        self._count = torch.zeros(worlds, dtype=torch.float64)
+
+    def update(self, value: Tensor, head_height: Tensor, active: Tensor) -> Tensor:
+        """Record a frame and say which worlds must be reset.
+
+        Every frame of the take counts in the mean, this one and those that triggered included, so that a stretch the
+        value network rates low throughout ends in a lower bar and not in a reset at every frame. A mean that is not
+        positive says nothing of a drop, and nothing triggers then.
+
+        Args:
+            value: ``[N]`` V(s_t).
+            head_height: ``[N]`` metres above the ground.
+            active: ``[N]`` bool, worlds whose take still runs.
+
+        Returns:
+            ``[N]`` bool.
+        """
+        value = value.detach().to(torch.float64)
+        self._sum += torch.where(active, value, torch.zeros_like(value))
+        self._count += active
+        mean = self._sum / self._count.clamp(min=1)
+        ratio = torch.where(mean > 0, value / mean, torch.ones_like(value))
+        self.confidence.append(torch.where(active, ratio, torch.full_like(ratio, float("nan"))))
+        triggered = active & self._unstable(ratio, head_height)
+        self.resets += triggered
+        return triggered
+
+    def _unstable(self, ratio: Tensor, head_height: Tensor) -> Tensor:
+        if self.mode == "value":
+            return ratio < self.kappa
+        if self.mode == "naive":
+            return head_height < self.fallen_height
+        return torch.zeros_like(ratio, dtype=torch.bool)
