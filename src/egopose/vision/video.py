@@ -1,0 +1,207 @@
+"""MP4 in and out: frames are uint8 RGB ``[H, W, 3]``, times are seconds from the video's first frame."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from os import PathLike
+from pathlib import Path
+from types import TracebackType
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from egopose.errors import InputError
+
+Frame = NDArray[np.uint8]
+
+# Beyond any camera sold (8K is 7680 x 4320): a header that says more is broken or hostile.
+MAX_SIDE = 8192
+MAX_FPS = 1000.0
+
+
+@dataclass(frozen=True)
+class VideoInfo:
+    """What a video's header says; ``frames`` is the header's word and may be wrong by a few."""
+
+    width: int
+    height: int
+    fps: float
+    frames: int
+
+
+class VideoWriter:
+    """Writes frames to an MP4 (``mp4v``), complete or not at all.
+
+    The file is written under a temporary name beside ``path`` and renamed when the ``with`` block ends without an
+    error, so a file of that name is always a whole video.
+
+    Args:
+        path: the MP4 to write; its folder is made.
+        fps: frames per second.
+
+    Raises:
+        InputError: the encoder cannot write there, frames are not uint8 ``[H, W, 3]`` of one size, or there are none.
+    """
+
+    def __init__(self, path: str | PathLike[str], fps: float) -> None:
+        self.path, self.fps, self.frames = Path(path), fps, 0
+        self._partial = self.path.with_name(f".{self.path.stem}.partial.mp4")
+        self._writer: cv2.VideoWriter | None = None
+        self._shape: tuple[int, ...] = ()
+
+    def __enter__(self) -> VideoWriter:
+        return self
+
+    def write(self, frame: Frame) -> None:
+        """Append one RGB frame."""
+        if frame.dtype != np.uint8 or frame.ndim != 3 or frame.shape[2] != 3:
+            raise InputError(self.path, "frame", f"expected uint8 [H, W, 3], got {frame.dtype} {list(frame.shape)}")
+        if self._writer is None:
+            self._open(frame.shape[1], frame.shape[0])
+            self._shape = frame.shape
+        if frame.shape != self._shape:
+            raise InputError(self.path, "frame", f"size {frame.shape[:2]} differs from the first's {self._shape[:2]}")
+        assert self._writer is not None
+        self._writer.write(cv2.cvtColor(frame, cv2.COLOR_RGB2BGR))
+        self.frames += 1
+
+    def _open(self, width: int, height: int) -> None:
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        fourcc = cv2.VideoWriter.fourcc(*"mp4v")
+        self._writer = cv2.VideoWriter(str(self._partial), cv2.CAP_FFMPEG, fourcc, self.fps, (width, height))
+        if not self._writer.isOpened():
+            raise InputError(
+                self.path, "video", f"cannot open an mp4v encoder for {width} x {height} at {self.fps} fps"
+            )
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._writer is not None:
+            self._writer.release()
+        if kind is not None:
+            self._partial.unlink(missing_ok=True)
+            return
+        if not self.frames:
+            raise InputError(self.path, "video", "no frames were written")
+        self._partial.replace(self.path)
+
+
+def write_video(path: str | PathLike[str], frames: Iterable[Frame], fps: float) -> int:
+    """Write RGB frames to an MP4; returns how many. Raises as :class:`VideoWriter`."""
+    with VideoWriter(path, fps) as writer:
+        for frame in frames:
+            writer.write(frame)
+    return writer.frames
+
+
+@contextmanager
+def _capture(path: str | PathLike[str]) -> Iterator[tuple[cv2.VideoCapture, VideoInfo]]:
+    """An opened capture whose header has been found sane."""
+    if not Path(path).is_file():
+        raise InputError(path, "video", "no such file")
+    if Path(path).stat().st_size == 0:
+        raise InputError(path, "video", "the file is empty")
+    capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
+    try:
+        if not capture.isOpened():
+            raise InputError(path, "video", "not a video that FFmpeg can open: damaged, or of an unknown format")
+        info = VideoInfo(
+            int(capture.get(cv2.CAP_PROP_FRAME_WIDTH)),
+            int(capture.get(cv2.CAP_PROP_FRAME_HEIGHT)),
+            float(capture.get(cv2.CAP_PROP_FPS)),
+            int(max(capture.get(cv2.CAP_PROP_FRAME_COUNT), 0)),
+        )
+        if not (0 < info.width <= MAX_SIDE and 0 < info.height <= MAX_SIDE):
+            raise InputError(path, "size", f"{info.width} x {info.height}; up to {MAX_SIDE} x {MAX_SIDE} can be read")
+        if not 0 < info.fps <= MAX_FPS:
+            raise InputError(path, "fps", f"{info.fps}; expected more than 0 and at most {MAX_FPS:g}")
+        yield capture, info
+    finally:
+        capture.release()
+
+
+def probe_video(path: str | PathLike[str]) -> VideoInfo:
+    """Size, rate and announced number of frames. Raises InputError as :func:`read_frames`."""
+    with _capture(path) as (_, info):
+        return info
+
+
+def read_frames(path: str | PathLike[str]) -> Iterator[tuple[float, Frame]]:
+    """Decode a video: ``(seconds since its first frame, RGB frame)`` in order.
+
+    The times are the file's own presentation stamps, so videos of a varying rate come out right. Where a stamp does
+    not advance (some recorders leave them out) the header's rate takes its place.
+
+    Raises:
+        InputError: missing, empty or damaged file, no frame in it, a size or rate that cannot be.
+    """
+    with _capture(path) as (capture, info):
+        first = last = None
+        while True:
+            ok, bgr = capture.read()
+            if not ok:
+                break
+            stamp = capture.get(cv2.CAP_PROP_POS_MSEC) / 1000.0
+            if first is None or last is None:
+                first, time = stamp, 0.0
+            else:
+                time = stamp - first if stamp - first > last else last + 1.0 / info.fps
+            last = time
+            yield time, cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB).astype(np.uint8, copy=False)
+        if first is None:
+            raise InputError(path, "video", "no frame can be decoded: the file is damaged")
+
+
+def iter_frames(
+    path: str | PathLike[str], fps: float = 30.0, offset: float = 0.0, count: int | None = None
+) -> Iterator[Frame]:
+    """The video's frames at the motion's times: frame k is the one nearest to video time ``k / fps + offset``.
+
+    Args:
+        path: any MP4.
+        fps: the motion's rate.
+        offset: sync offset in seconds: what the motion shows at time t, the video shows at t + offset.
+        count: number of motion frames; None takes every one until the video ends.
+
+    Raises:
+        InputError: as :func:`read_frames`; and when the motion starts before the video or ends after it by more than
+            one video frame, saying by how much.
+    """
+    if not fps > 0:
+        raise InputError(path, "fps", f"must be positive, got {fps}")
+    emitted = 0
+    # Half a frame of the motion of tolerance: a stamp of 33.33 ms beside a time of 33.34 ms is the same instant.
+    if offset < -0.5 / fps:
+        raise InputError(path, "sync_offset", f"the motion starts {-offset:.3f} s before the video: cut its beginning")
+    previous: tuple[float, Frame] | None = None
+    interval = 1.0 / fps
+    for time, frame in read_frames(path):
+        if previous is not None:
+            interval = time - previous[0]
+            middle = 0.5 * (previous[0] + time)
+            while emitted / fps + offset <= middle and (count is None or emitted < count):
+                yield previous[1]
+                emitted += 1
+        if count is not None and emitted >= count:
+            return
+        previous = (time, frame)
+    assert previous is not None
+    end, frame = previous
+    while emitted / fps + offset <= end + 0.5 * interval and (count is None or emitted < count):
+        yield frame
+        emitted += 1
+    if emitted == 0:
+        raise InputError(path, "sync_offset", f"{offset:.3f} s lies behind the video's end at {end:.3f} s")
+    missing = 0 if count is None else count - emitted
+    if missing > max(interval * fps, 1.0):
+        raise InputError(
+            path,
+            "length",
+            f"the video ends {missing / fps:.3f} s before the motion: cut the motion's end or the offset",
+        )
+    for _ in range(missing):
+        yield frame
