@@ -1,0 +1,259 @@
+"""BVH text to numbers, in the file's own units and axes.
+
+The parser keeps its own stack, so nesting costs no recursion, and compares what is announced with the bytes that are
+there before it makes room for anything.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+import warnings
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from egopose.errors import InputError
+from egopose.motion.io._files import MAX_JOINTS, excerpt, read_text
+from egopose.motion.rotations import Array
+
+_MOTION = re.compile(r"^[ \t]*MOTION[ \t]*$", re.MULTILINE)
+_CHANNELS = {f"{axis}{kind}" for axis in "xyz" for kind in ("position", "rotation")}
+
+#: Coordinates beyond this (in any unit) are no person's.
+_MAX_VALUE = 1e7
+
+#: Characters a written number may take: the longest double is 24.
+_MAX_NUMBER_CHARACTERS = 64
+
+
+@dataclass
+class BvhJoint:
+    """A joint as written: ``channels`` are lower case, ``"xposition"`` ... ``"zrotation"``, in the file's order."""
+
+    name: str
+    parent: int
+    line: int
+    offset: tuple[float, float, float] | None = None
+    channels: tuple[str, ...] | None = None
+    tips: list[tuple[float, float, float]] = field(default_factory=list)
+
+
+@dataclass(frozen=True)
+class BvhFile:
+    """``joints``, seconds a frame, and ``values [T, C]`` for all channels in order (degrees for rotations)."""
+
+    joints: list[BvhJoint]
+    frame_time: float
+    values: Array
+
+
+def parse_bvh(path: Path) -> BvhFile:
+    """Read a BVH file.
+
+    Raises:
+        InputError: names the file, the line and what is wrong there.
+    """
+    text = read_text(path)
+    motion = _MOTION.search(text)
+    if motion is None:
+        raise InputError(path, f"line {text.count(chr(10)) + 1}", "no MOTION section: not a BVH file, or cut short")
+    joints = _parse_hierarchy(path, text, motion.start())
+    frame_time, values = _parse_motion(path, text, motion.end(), sum(len(j.channels or ()) for j in joints))
+    return BvhFile(joints, frame_time, values)
+
+
+def _parse_hierarchy(path: Path, text: str, end: int) -> list[BvhJoint]:
+    joints: list[BvhJoint] = []
+    names: dict[str, int] = {}
+    stack: list[int] = []  # open braces: joint indices, -1 for an End Site
+    pending: int | None = None  # a joint or End Site announced, its brace not yet seen
+    started = closed = False
+    start, number = 0, 0
+    while start < end:
+        stop = text.find("\n", start, end)
+        stop = end if stop < 0 else stop
+        number += 1
+        where = f"line {number}"
+        if stop - start > 64 * 1024:
+            raise InputError(path, where, f"{stop - start} characters long: not a line of a BVH hierarchy")
+        tokens = text[start:stop].replace("{", " { ").replace("}", " } ").split()
+        start = stop + 1
+        while tokens:
+            word = tokens.pop(0)
+            key = word.upper()
+            if not started:
+                if key != "HIERARCHY":
+                    raise InputError(path, where, f"expected HIERARCHY, found {excerpt(word)}: not a BVH file")
+                started = True
+            elif word == "{":
+                if pending is None:
+                    raise InputError(path, where, "'{' without a ROOT, JOINT or End Site before it")
+                stack.append(pending)
+                pending = None
+            elif pending is not None:
+                raise InputError(path, where, f"expected '{{', found {excerpt(word)}")
+            elif word == "}":
+                if not stack:
+                    raise InputError(path, where, "'}' without a '{' before it")
+                top = stack.pop()
+                if top >= 0 and joints[top].offset is None:
+                    raise InputError(path, where, f"joint {joints[top].name!r} has no OFFSET")
+                closed = not stack
+            elif key in ("ROOT", "JOINT"):
+                cut = tokens.index("{") if "{" in tokens else len(tokens)
+                name, tokens = " ".join(tokens[:cut]), tokens[cut:]
+                if not name:
+                    raise InputError(path, where, f"{key} without a name")
+                if (key == "ROOT") != (not joints) or closed:
+                    raise InputError(path, where, "one ROOT must stand first and hold everything else")
+                if joints and (not stack or stack[-1] < 0):
+                    raise InputError(path, where, f"JOINT {excerpt(name)} stands in no other joint")
+                if name in names:
+                    raise InputError(path, where, f"joint {excerpt(name)} stands twice, first on line {names[name]}")
+                if len(joints) >= MAX_JOINTS:
+                    raise InputError(path, where, f"more than {MAX_JOINTS} joints")
+                names[name] = number
+                joints.append(BvhJoint(name, stack[-1] if stack else -1, number))
+                pending = len(joints) - 1
+            elif key == "END":
+                if not stack or stack[-1] < 0:
+                    raise InputError(path, where, "End Site outside a joint")
+                cut = tokens.index("{") if "{" in tokens else len(tokens)
+                tokens = tokens[cut:]
+                pending = -1
+            elif key == "OFFSET":
+                offset, tokens = _numbers(path, where, "OFFSET", tokens, 3), tokens[3:]
+                if not stack:
+                    raise InputError(path, where, "OFFSET outside a joint")
+                if stack[-1] >= 0:
+                    joints[stack[-1]].offset = offset
+                else:
+                    joints[stack[-2]].tips.append(offset)
+            elif key == "CHANNELS":
+                if not stack or stack[-1] < 0:
+                    raise InputError(path, where, "CHANNELS outside a joint")
+                count = int(tokens[0]) if tokens and re.fullmatch(r"[0-9]{1,3}", tokens[0]) else -1
+                if not 0 <= count <= 6:
+                    raise InputError(
+                        path, where, f"CHANNELS wants a count of 0 to 6, got {excerpt(''.join(tokens[:1]))}"
+                    )
+                channels, tokens = tuple(t.lower() for t in tokens[1 : count + 1]), tokens[count + 1 :]
+                unknown = [c for c in channels if c not in _CHANNELS]
+                if unknown or len(channels) != count:
+                    cause = (
+                        f"unknown channel {excerpt(unknown[0])}" if unknown else f"{len(channels)} of {count} channels"
+                    )
+                    raise InputError(path, where, cause)
+                positions = [c for c in channels if c.endswith("position")]
+                if len(set(positions)) != len(positions) or count - len(positions) > 3:
+                    raise InputError(path, where, "a channel stands twice")
+                joints[stack[-1]].channels = channels
+            else:
+                raise InputError(path, where, f"unknown word {excerpt(word)} in the hierarchy")
+    where = f"line {number}"
+    if not joints:
+        raise InputError(path, where, "no ROOT joint before MOTION")
+    if stack or pending is not None:
+        raise InputError(path, where, f"{max(len(stack), 1)} brace(s) not closed before MOTION")
+    if not any(j.channels for j in joints):
+        raise InputError(path, where, "no joint has CHANNELS")
+    return joints
+
+
+def _numbers(path: Path, where: str, label: str, tokens: list[str], count: int) -> tuple[float, float, float]:
+    try:
+        values = tuple(float(t) for t in tokens[:count])
+    except ValueError:
+        raise InputError(path, where, f"{label} {excerpt(' '.join(tokens[:count]))} is not {count} numbers") from None
+    if len(values) != count:
+        raise InputError(path, where, f"{label} wants {count} numbers, got {len(values)}")
+    if not all(abs(v) < _MAX_VALUE for v in values):
+        raise InputError(path, where, f"{label} {excerpt(' '.join(tokens[:count]))} is not finite or absurdly large")
+    return values[0], values[1], values[2]
+
+
+def _parse_motion(path: Path, text: str, start: int, n_channels: int) -> tuple[float, Array]:
+    number = text.count("\n", 0, start) + 1
+    fields: dict[str, tuple[str, int]] = {}
+    position = start + 1
+    while len(fields) < 2 and position < len(text):
+        stop = text.find("\n", position)
+        stop = len(text) if stop < 0 else stop
+        number += 1
+        line = text[position : min(stop, position + 200)].strip()
+        position = stop + 1
+        if not line:
+            continue
+        key, colon, value = line.partition(":")
+        key = " ".join(key.lower().split())
+        if not colon or key not in ("frames", "frame time"):
+            raise InputError(path, f"line {number}", f"expected 'Frames:' and 'Frame Time:', found {excerpt(line)}")
+        fields[key] = (value.strip(), number)
+    for key in ("frames", "frame time"):
+        if key not in fields:
+            raise InputError(path, f"line {number}", f"the file ends before '{key.title()}:'")
+
+    value, where = fields["frames"]
+    if not re.fullmatch(r"\+?[0-9]{1,18}", value) or int(value) == 0:
+        raise InputError(path, f"line {where}", f"Frames must be a positive whole number, got {excerpt(value)}")
+    frames = int(value)
+    room = len(text) - position
+    if frames * n_channels * 2 > room + 2:  # a number and the blank after it take two bytes at least
+        cause = f"{frames} frames of {n_channels} numbers announced, only {max(room, 0)} bytes follow: cut short or a false count"
+        raise InputError(path, f"line {where}", cause)
+    value, where = fields["frame time"]
+    try:
+        frame_time = float(value)
+    except ValueError:
+        raise InputError(path, f"line {where}", f"Frame Time {excerpt(value)} is not a number") from None
+    if not (math.isfinite(frame_time) and 1e-5 <= frame_time <= 10.0):
+        raise InputError(path, f"line {where}", f"Frame Time {excerpt(value)} s is not between 1e-5 and 10")
+    return frame_time, _parse_frames(path, text, position, number + 1, frames, n_channels)
+
+
+def _parse_frames(path: Path, text: str, start: int, first_line: int, frames: int, n_channels: int) -> Array:
+    """The motion block ``[frames, n_channels]``; every line that is not blank is a frame."""
+    longest, rows, number, position = _MAX_NUMBER_CHARACTERS * n_channels + 1024, 0, first_line, start
+    while position < len(text):
+        stop = text.find("\n", position)
+        stop = len(text) if stop < 0 else stop
+        if stop - position > longest:
+            cause = f"{stop - position} characters long; {n_channels} numbers do not take as many"
+            raise InputError(path, f"line {number}", cause)
+        count = len(text[position:stop].split())
+        if count:
+            rows += 1
+            if rows > frames:
+                raise InputError(path, f"line {number}", f"more than the {frames} frames announced")
+            if count != n_channels:
+                cause = f"frame {rows} of {frames} has {count} numbers, the hierarchy has {n_channels} channels"
+                raise InputError(path, f"line {number}", cause)
+        position, number = stop + 1, number + 1
+    if rows != frames:
+        raise InputError(
+            path, f"line {number - 1}", f"{frames} frames announced, the file ends after {rows}: cut short"
+        )
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DeprecationWarning)  # NumPy's way of saying it stopped at a word
+        try:
+            values = np.fromstring(text[start:], sep=" ")
+        except ValueError:
+            values = np.empty(0)
+    if values.size != frames * n_channels or not (np.abs(values) < _MAX_VALUE).all():
+        _blame(path, text, start, first_line)
+    return values.reshape(frames, n_channels)
+
+
+def _blame(path: Path, text: str, start: int, first_line: int) -> None:
+    """Raise on the first number that is none; only called when there is one."""
+    for number, line in enumerate(text[start:].split("\n"), first_line):
+        for word in line.split():
+            try:
+                value = float(word)
+            except ValueError:
+                raise InputError(path, f"line {number}", f"{excerpt(word)} is not a number") from None
+            if not abs(value) < _MAX_VALUE:
+                raise InputError(path, f"line {number}", f"{excerpt(word)} is not finite or absurdly large")
+    raise InputError(path, f"line {first_line}", "the motion block holds something that is not a number")
