@@ -1,0 +1,75 @@
+"""From configuration and a reference to the environment."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from egopose.envs.env import EgoPoseEnv
+from egopose.envs.mdp.rewards import build_reward
+from egopose.envs.problem import ActionSettings, ImitationProblem, TakeTable, TerminationSettings
+from egopose.envs.starts import FragmentLike, Starts, UniformStarts, WholeFragments
+
+if TYPE_CHECKING:
+    from egopose.humanoid.model import HumanoidModel
+
+
+def build_problem(
+    humanoid: HumanoidModel,
+    reference: TensorDictBase,
+    takes: TakeTable,
+    task: Mapping[str, Any],
+    reward: Mapping[str, Any],
+    *,
+    action_reference: Tensor | None = None,
+) -> ImitationProblem:
+    """The imitation problem of a ``conf/task`` and a ``conf/reward`` file.
+
+    Raises:
+        ValueError: see :class:`ImitationProblem` and :func:`build_reward`.
+    """
+    return ImitationProblem(
+        humanoid,
+        reference,
+        takes,
+        build_reward(reward),
+        ActionSettings(**task["action"]),
+        TerminationSettings(**task["termination"]),
+        action_reference,
+    )
+
+
+def build_env(
+    problem: ImitationProblem,
+    fragments: Sequence[FragmentLike],
+    n_worlds: int,
+    task: Mapping[str, Any],
+    *,
+    threads: int = 1,
+    seed: int = 0,
+    whole_fragments: bool = False,
+    dump_dir: str | Path | None = None,
+) -> EgoPoseEnv:
+    """The batched environment.
+
+    Args:
+        problem: see :func:`build_problem`.
+        fragments: where episodes lie.
+        n_worlds: N; with ``whole_fragments`` usually their number.
+        task: ``conf/task``.
+        threads: of the physics.
+        seed: of the starts.
+        whole_fragments: evaluation: each world runs its own fragment from end to end.
+        dump_dir: where diverged worlds leave their last states.
+    """
+    offsets, lengths = problem.takes.offsets, problem.takes.lengths
+    starts: Starts
+    if whole_fragments:
+        starts = WholeFragments(fragments, offsets, lengths)
+    else:
+        starts = UniformStarts(fragments, offsets, lengths, task["horizon"], task["minimum"])
+    return EgoPoseEnv(problem, n_worlds, starts, threads=threads, seed=seed, dump_dir=dump_dir)

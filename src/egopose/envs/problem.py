@@ -1,0 +1,153 @@
+"""One definition of the imitation problem, shared by the batched environment and the dm_control task."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+
+from egopose.envs.mdp import observations as obs
+from egopose.envs.mdp import terminations
+from egopose.envs.mdp.rewards import BodyLayout, Reward
+
+if TYPE_CHECKING:
+    from egopose.humanoid.model import HumanoidModel
+
+BODY_KEYS = ("qpos", "qvel", "xpos", "xquat", "com")
+
+
+@dataclass(frozen=True)
+class TakeTable:
+    """Where the takes lie among the reference's frames.
+
+    Args:
+        offsets: ``[K]`` int64, first frame of each take.
+        lengths: ``[K]`` int64, frames.
+        lowest_head_height: ``[K]`` float64 m, the lowest the reference's head gets in the take.
+    """
+
+    offsets: Tensor
+    lengths: Tensor
+    lowest_head_height: Tensor
+
+
+@dataclass(frozen=True)
+class ActionSettings:
+    """What an action is added to.
+
+    Args:
+        reference: ``rest``: the rest pose (the paper); ``regressor``: a table of joint targets, one row a frame.
+        scale: of the action, rad per unit.
+        velocity_feedforward: with ``regressor``, kd/kp times the table's joint velocity times this is added to the
+            target, against the lag of a PD controller.
+    """
+
+    reference: str = "rest"
+    scale: float = 1.0
+    velocity_feedforward: float = 0.0
+
+    def __post_init__(self) -> None:
+        if self.reference not in ("rest", "regressor"):
+            raise ValueError(f"action.reference must be rest or regressor, not {self.reference!r}")
+
+
+@dataclass(frozen=True)
+class TerminationSettings:
+    """When a fall ends the episode.
+
+    Args:
+        enabled: off in evaluation, where the fail-safe answers a fall.
+        head_drop: m below the take's lowest reference head height.
+    """
+
+    enabled: bool = True
+    head_drop: float = 0.1
+
+
+class ImitationProblem:
+    """State, reward, termination and PD targets as functions of body states and frames.
+
+    Args:
+        humanoid: the model.
+        reference: TensorDict ``[F]`` of body states (float64), all takes one after the other.
+        takes: where they lie.
+        reward: see :mod:`egopose.envs.mdp.rewards`.
+        action, termination: settings.
+        action_reference: ``[F, nu]`` rad, the base target for reaching each frame; needed by ``regressor``.
+
+    Raises:
+        ValueError: the reference does not fit the humanoid, or the action's table is missing or of another shape.
+    """
+
+    def __init__(
+        self,
+        humanoid: HumanoidModel,
+        reference: TensorDictBase,
+        takes: TakeTable,
+        reward: Reward,
+        action: ActionSettings,
+        termination: TerminationSettings,
+        action_reference: Tensor | None = None,
+    ) -> None:
+        model = humanoid.mj_model
+        if reference["qpos"].shape[1:] != (model.nq,) or reference["qvel"].shape[1:] != (model.nv,):
+            raise ValueError(
+                f"reference qpos and qvel have {reference['qpos'].shape[-1]} and {reference['qvel'].shape[-1]} "
+                f"columns, the humanoid {model.nq} and {model.nv}"
+            )
+        if reference["xpos"].shape[1] != len(humanoid.body_ids):
+            raise ValueError(
+                f"reference has {reference['xpos'].shape[1]} bodies, the humanoid {len(humanoid.body_ids)}"
+            )
+        self.humanoid, self.takes, self.reward = humanoid, takes, reward
+        self.action, self.termination = action, termination
+        self.n_frames = reference.shape[0]
+        self.reference = reference
+        # Plain tensors: indexing them costs a third of indexing the (memory-mapped) TensorDict each step.
+        self._reference = {k: torch.as_tensor(reference[k]).to(torch.float64) for k in BODY_KEYS}
+        self.layout = BodyLayout(torch.as_tensor(humanoid.joint_parent), torch.as_tensor(humanoid.end_effectors))
+        self._range = torch.as_tensor(humanoid.joint_range, dtype=torch.float64).T
+        self._rest = torch.as_tensor(humanoid.rest_action, dtype=torch.float64)
+        self._table: Tensor | None = None
+        if action.reference == "regressor":
+            if action_reference is None or action_reference.shape != (self.n_frames, model.nu):
+                got = "none" if action_reference is None else list(action_reference.shape)
+                raise ValueError(
+                    f"action.reference=regressor needs joint targets [{self.n_frames}, {model.nu}], got {got}"
+                )
+            lag = torch.as_tensor(humanoid.kd / humanoid.kp) * action.velocity_feedforward
+            table = torch.as_tensor(action_reference).to(torch.float64)
+            self._table = table + lag * self._table_velocity(table)
+
+    def _table_velocity(self, table: Tensor) -> Tensor:
+        """``[F, nu]`` rad/s by which each frame is reached from the one before, within its take."""
+        velocity = torch.zeros_like(table)
+        velocity[1:] = table.diff(dim=0) / self.humanoid.control_dt
+        for offset, length in zip(self.takes.offsets.tolist(), self.takes.lengths.tolist(), strict=True):
+            velocity[offset] = velocity[offset + 1] if length > 1 else 0.0
+        return velocity
+
+    def reference_at(self, frame: Tensor) -> TensorDict:
+        """Body states ``[N]`` of the reference at global frames ``[N]``."""
+        return TensorDict({k: v[frame] for k, v in self._reference.items()}, batch_size=frame.shape)
+
+    def target(self, action: Tensor, frame: Tensor) -> Tensor:
+        """PD targets ``[N, nu]`` rad from actions ``[N, nu]``, for reaching frames ``[N]``; within joint range."""
+        base = self._rest if self._table is None else self._table[frame]
+        return torch.clamp(base + self.action.scale * action.to(torch.float64), self._range[0], self._range[1])
+
+    def observation(self, state: TensorDictBase) -> Tensor:
+        """The humanoid state ``[N, 115]``, float64."""
+        return obs.humanoid_state(state)
+
+    def rewards(self, state: TensorDictBase, frame: Tensor, step: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
+        """Reward ``[N]`` and its terms for states at global frames ``[N]``, ``step [N]`` steps into the episode."""
+        return self.reward(state, self.reference_at(frame), self.layout, step)
+
+    def fallen(self, state: TensorDictBase, take: Tensor) -> Tensor:
+        """``[N]``: the head is too low for ``take [N]``, whether or not that ends the episode."""
+        lowest = self.takes.lowest_head_height[take]
+        return terminations.fallen(state, int(self.humanoid.head), lowest, self.termination.head_drop)

@@ -1,0 +1,124 @@
+"""The same problem as a dm_control task: one world, for the viewer, for debugging, for dm_control's own tools."""
+
+from __future__ import annotations
+
+import copy
+from collections import OrderedDict
+from typing import Any
+
+import dm_env
+import mujoco
+import numpy as np
+import torch
+from dm_control import mujoco as dm_mujoco
+from dm_control.rl import control
+from dm_env import specs
+from numpy.typing import NDArray
+from tensordict import TensorDict
+from torch import Tensor
+
+from egopose.envs.problem import ImitationProblem
+from egopose.envs.starts import Starts
+
+
+class HumanoidPhysics(dm_mujoco.Physics):
+    """One world that steps as :class:`~egopose.humanoid.physics.BatchedPhysics` does.
+
+    The constraint solver starts cold at every control step, and a step that diverges does not raise: the world goes
+    back to where it was, at rest, and :attr:`diverged` says so.
+    """
+
+    diverged = False
+    max_speed = 1e3
+
+    def step(self, nstep: int = 1) -> None:
+        data = self.data
+        before = (data.time, data.qpos.copy(), data.qvel.copy())
+        data.qacc_warmstart[:] = 0.0
+        with self.suppress_physics_errors():
+            super().step(nstep)
+        due = before[0] + nstep * self.model.opt.timestep
+        self.diverged = not (
+            np.isfinite(data.qpos).all()
+            and (np.abs(data.qvel) < self.max_speed).all()
+            and np.isfinite(data.ctrl).all()
+            and abs(data.time - due) < 0.5 * self.model.opt.timestep
+        )
+        if self.diverged:
+            data.time, data.qpos[:], data.qvel[:] = before[0], before[1], 0.0
+            data.ctrl[:] = 0.0
+            mujoco.mj_forward(self.model.ptr, data.ptr)
+
+
+class EgoPoseTask(control.Task):
+    """State, reward and termination of :class:`ImitationProblem` for ``dm_control.rl.control.Environment``.
+
+    Observations: ``humanoid_state [115]`` float64 and ``frame [1]`` int64. The last time step has discount 0 after a
+    fall or diverged physics and 1 at the end of the fragment or horizon.
+
+    Args:
+        problem: humanoid, reference, reward, action and termination.
+        starts: deals episodes.
+        seed: of the starts.
+    """
+
+    def __init__(self, problem: ImitationProblem, starts: Starts, seed: int = 0) -> None:
+        self.problem, self.starts = problem, starts
+        self._generator = torch.Generator().manual_seed(seed)
+        self._take, self._start, self._stop, self._frame = (torch.zeros(1, dtype=torch.int64) for _ in range(4))
+        self.reward_terms: dict[str, float] = {}
+
+    def initialize_episode(self, physics: HumanoidPhysics) -> None:
+        episode = self.starts(torch.zeros(1, dtype=torch.int64), self._generator)
+        self._take, self._start, self._stop = episode.take, episode.start, episode.stop
+        self._frame = episode.start
+        reference = self.problem.reference_at(self._frame)
+        physics.data.qpos[:] = reference["qpos"][0].numpy()
+        physics.data.qvel[:] = reference["qvel"][0].numpy()
+        physics.diverged = False
+
+    def before_step(self, action: NDArray[np.floating] | Tensor, physics: HumanoidPhysics) -> None:
+        self._frame = torch.minimum(self._frame + 1, self._stop - 1)
+        target = self.problem.target(torch.as_tensor(np.asarray(action))[None], self._frame)
+        physics.set_control(target[0].numpy())
+
+    def action_spec(self, physics: HumanoidPhysics) -> specs.BoundedArray:
+        # Whatever is added to a joint's target, half a turn is as far as it can matter.
+        return specs.BoundedArray((physics.model.nu,), np.float64, -np.pi, np.pi, name="action")
+
+    def get_observation(self, physics: HumanoidPhysics) -> OrderedDict[str, NDArray[Any]]:
+        state = self._body_state(physics)
+        return OrderedDict(humanoid_state=self.problem.observation(state)[0].numpy(), frame=self._frame.numpy().copy())
+
+    def get_reward(self, physics: HumanoidPhysics) -> float:
+        reward, terms = self.problem.rewards(self._body_state(physics), self._frame, self._frame - self._start)
+        self.reward_terms = {k: 0.0 if physics.diverged else float(v) for k, v in terms.items()}
+        return 0.0 if physics.diverged else float(reward)
+
+    def get_termination(self, physics: HumanoidPhysics) -> float | None:
+        fallen = bool(self.problem.fallen(self._body_state(physics), self._take))
+        if physics.diverged or (fallen and self.problem.termination.enabled):
+            return 0.0
+        return 1.0 if bool(self._frame >= self._stop - 1) else None
+
+    def _body_state(self, physics: HumanoidPhysics) -> TensorDict:
+        # dm_control's step ends with mj_step1, so positions are those of the present qpos.
+        data, ids = physics.data, self.problem.humanoid.body_ids
+        mass = physics.model.body_mass[ids]
+        arrays = {
+            "qpos": data.qpos.copy(),
+            "qvel": data.qvel.copy(),
+            "xpos": data.xpos[ids],
+            "xquat": data.xquat[ids],
+            "com": mass @ data.xipos[ids] / mass.sum(),
+        }
+        return TensorDict({k: torch.from_numpy(np.asarray(v))[None] for k, v in arrays.items()}, batch_size=[1])
+
+
+def load_environment(problem: ImitationProblem, starts: Starts, seed: int = 0) -> dm_env.Environment:
+    """One world as a dm_env, ready for ``dm_control.viewer.launch`` or TorchRL's ``DMControlWrapper``."""
+    # A copy: dm_control switches actuation off and on in the model while it resets.
+    physics = HumanoidPhysics.from_model(copy.copy(problem.humanoid.mj_model))
+    return control.Environment(
+        physics, EgoPoseTask(problem, starts, seed), n_sub_steps=problem.humanoid.substeps, legacy_step=True
+    )

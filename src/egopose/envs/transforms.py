@@ -1,0 +1,116 @@
+"""TorchRL transforms of the environment: the visual context of a frame, and the running normaliser of the state."""
+
+from __future__ import annotations
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+from torchrl.data import Composite, TensorSpec, Unbounded
+from torchrl.envs.transforms import Transform
+
+
+class VisualContext(Transform):
+    """Looks up each world's row of a table over all frames of the store.
+
+    The table belongs to the data, not to the learner: it is no part of the state dict and may be memory-mapped.
+    Assign :attr:`table` to look up in another one.
+
+    Args:
+        table: ``[F, D]``, float32 features or context of every frame.
+        key: of the row it writes, ``visual_context`` or ``visual_features``.
+        frame_key: ``frame`` for the present frame; ``episode_start`` keeps the row of the first one (forecasting).
+    """
+
+    def __init__(self, table: Tensor, key: str = "visual_context", frame_key: str = "frame") -> None:
+        super().__init__(in_keys=[frame_key], out_keys=[key])
+        self.table = table
+
+    def _apply_transform(self, obs: Tensor) -> Tensor:
+        return self.table[obs.squeeze(-1)]
+
+    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
+        return self._call(tensordict_reset)
+
+    def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
+        assert isinstance(observation_spec, Composite)
+        shape = (*observation_spec.shape, self.table.shape[-1])
+        observation_spec[self.out_keys[0]] = Unbounded(shape, dtype=self.table.dtype, device=observation_spec.device)
+        return observation_spec
+
+
+class StateNormalizer(Transform):
+    """Running mean and deviation of an observation, normalised in place and clipped (the papers' online z-filter).
+
+    Sums are float64 and merged by Chan's rule (Chan, Golub & LeVeque 1979), which keeps constant and large features
+    exact where E[x^2] - E[x]^2 does not. Every new observation counts once: all worlds at a step, and at a reset only
+    the worlds that were reset. The statistics are buffers and so part of the state dict.
+
+    Args:
+        size: D of the observation ``[..., D]``.
+        key: of the observation.
+        clip: bound of the normalised values (5 in the authors' program).
+        frozen: start without updates, see :meth:`freeze`.
+    """
+
+    count: Tensor
+    mean: Tensor
+    sum_of_squares: Tensor
+
+    def __init__(self, size: int, key: str = "humanoid_state", clip: float = 5.0, frozen: bool = False) -> None:
+        super().__init__(in_keys=[key], out_keys=[key])
+        self.clip, self.frozen = clip, frozen
+        self.register_buffer("count", torch.zeros((), dtype=torch.int64))
+        self.register_buffer("mean", torch.zeros(size, dtype=torch.float64))
+        self.register_buffer("sum_of_squares", torch.zeros(size, dtype=torch.float64))
+
+    @property
+    def std(self) -> Tensor:
+        """``[D]`` sample deviation; ones before two observations were seen."""
+        if self.count < 2:
+            return torch.ones_like(self.mean)
+        return (self.sum_of_squares / (self.count - 1)).sqrt()
+
+    def freeze(self, frozen: bool = True) -> StateNormalizer:
+        """Stop (or take up again) the updates; normalising goes on."""
+        self.frozen = frozen
+        return self
+
+    def update(self, values: Tensor) -> None:
+        """Count the rows of ``values [n, D]``."""
+        n = values.shape[0]
+        if n == 0:
+            return
+        values = values.to(torch.float64)
+        mean = values.mean(0)
+        total = self.count + n
+        delta = mean - self.mean
+        self.sum_of_squares += (values - mean).square().sum(0) + delta.square() * (self.count * n / total)
+        self.mean += delta * (n / total)
+        self.count += n
+
+    def normalize(self, values: Tensor) -> Tensor:
+        """``values [..., D]`` by the present statistics, in their own dtype."""
+        # The floor keeps a constant feature's rounding noise from being blown up.
+        scaled = (values.to(torch.float64) - self.mean) / (self.std + 1e-8)
+        return scaled.clamp(-self.clip, self.clip).to(values.dtype)
+
+    def _apply_transform(self, obs: Tensor) -> Tensor:
+        return self.normalize(obs)
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Normalise without counting (outside an environment)."""
+        return tensordict.set(self.out_keys[0], self.normalize(tensordict[self.in_keys[0]]))
+
+    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
+        values = next_tensordict[self.in_keys[0]]
+        if not self.frozen:
+            self.update(values.reshape(-1, values.shape[-1]))
+        return next_tensordict.set(self.out_keys[0], self.normalize(values))
+
+    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
+        values = tensordict_reset[self.in_keys[0]]
+        mask = None if tensordict is None else tensordict.get("_reset", None)
+        if not self.frozen:
+            fresh = values.reshape(-1, values.shape[-1])
+            self.update(fresh if mask is None else fresh[mask.reshape(-1)])
+        return tensordict_reset.set(self.out_keys[0], self.normalize(values))
