@@ -1,0 +1,155 @@
+"""Inverse kinematics of a :class:`Skeleton`, all frames at once: damped Gauss-Newton on positions and orientations."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+
+from egopose.motion import rotations as rot
+from egopose.motion.kinematics import forward_kinematics
+from egopose.motion.rotations import Array
+from egopose.motion.skeleton import Skeleton
+
+
+@dataclass(frozen=True)
+class Targets:
+    """What the frames should reach.
+
+    Args:
+        point_joint: ``[K]`` joint index each point hangs on.
+        point_offset: ``[K, 3]`` of the point in that joint's frame, metres.
+        positions: ``[T, K, 3]`` where the points should be, metres.
+        position_weight: ``[K]``, 1 for a point that counts fully.
+        frame_joint: ``[M]`` joints whose orientation counts.
+        orientations: ``[T, M, 4]`` quaternions.
+        orientation_weight: ``[M]`` metres per radian: what a radian is worth against a metre.
+    """
+
+    point_joint: np.ndarray
+    point_offset: Array
+    positions: Array
+    position_weight: Array
+    frame_joint: np.ndarray
+    orientations: Array
+    orientation_weight: Array
+
+
+@lru_cache(maxsize=32)
+def _moves(skeleton: Skeleton) -> np.ndarray:
+    """``[J, D]``: does degree of freedom d move joint j?"""
+    moves = np.zeros((len(skeleton), skeleton.n_dofs), dtype=bool)
+    for j in range(len(skeleton)):
+        if j:
+            moves[j] = moves[skeleton.parents[j]]
+        moves[j, skeleton.dof_slices[j]] = True
+    return moves
+
+
+def _hinge_axes(skeleton: Skeleton, qpos: Array, quats: Array) -> Array:
+    """World axes ``[T, D, 3]`` of all degrees of freedom (hinges only)."""
+    axes = np.empty((len(qpos), skeleton.n_dofs, 3))
+    for j, joint in enumerate(skeleton.joints):
+        if not joint.dofs:
+            continue
+        frame = quats[:, joint.parent]
+        for column, dof in zip(range(*skeleton.dof_slices[j].indices(skeleton.n_dofs)), joint.dofs, strict=True):
+            axis = np.array(dof.axis)
+            axes[:, column] = rot.rotate(frame, np.broadcast_to(axis, (len(qpos), 3)))
+            frame = rot.multiply(frame, rot.from_axis_angle(axis, qpos[:, 7 + column]))
+    return axes
+
+
+def solve(
+    skeleton: Skeleton,
+    start: Array,
+    targets: Targets,
+    limits: Array | None = None,
+    iterations: int = 12,
+    damping: float = 1e-3,
+    stay: float = 1e-3,
+) -> Array:
+    """Coordinates whose points and frames come nearest the targets, each frame from its own start.
+
+    Args:
+        skeleton: hinges only.
+        start: ``[T, nq]``.
+        targets: see :class:`Targets`.
+        limits: ``[D, 2]`` rad; steps are projected onto them.
+        iterations: Gauss-Newton steps.
+        damping: Levenberg's, on the step.
+        stay: weight of staying at ``start``: it decides what the targets leave open, such as the twist of a straight
+            arm.
+
+    Returns:
+        ``[T, nq]``.
+    """
+    chunks = [
+        _solve(skeleton, start[i : i + 512], _part(targets, slice(i, i + 512)), limits, iterations, damping, stay)
+        for i in range(0, len(start), 512)
+    ]
+    return np.concatenate(chunks)
+
+
+def _part(targets: Targets, frames: slice) -> Targets:
+    return Targets(
+        targets.point_joint,
+        targets.point_offset,
+        targets.positions[frames],
+        targets.position_weight,
+        targets.frame_joint,
+        targets.orientations[frames],
+        targets.orientation_weight,
+    )
+
+
+def _solve(
+    skeleton: Skeleton, start: Array, targets: Targets, limits: Array | None, iterations: int, damping: float, stay: float
+) -> Array:
+    moves, n = _moves(skeleton), skeleton.n_dofs
+    qpos, frames = start.copy(), len(start)
+    w_p, w_o = targets.position_weight[:, None], targets.orientation_weight[:, None]
+    k, m = len(targets.point_joint), len(targets.frame_joint)
+    for _ in range(iterations):
+        positions, quats = forward_kinematics(skeleton, qpos)
+        points = positions[:, targets.point_joint] + rot.rotate(quats[:, targets.point_joint], targets.point_offset[None])
+        axes = _hinge_axes(skeleton, qpos, quats)
+        origins = positions[:, skeleton.dof_joint]
+        jacobian = np.zeros((frames, 3 * (k + m), 6 + n))
+        arm = points[:, :, None] - origins[:, None]
+        turn = np.cross(np.broadcast_to(axes[:, None], arm.shape), arm) * moves[targets.point_joint][None, :, :, None]
+        jacobian[:, : 3 * k, 6:] = (turn * w_p[None, :, None]).transpose(0, 1, 3, 2).reshape(frames, 3 * k, n)
+        eye = np.eye(3)
+        jacobian[:, : 3 * k, :3] = (eye[None] * w_p[..., None]).reshape(3 * k, 3)
+        arm = points - positions[:, :1]
+        # d(point)/d(world rotation vector of the root) = -[arm]x
+        cross = np.zeros((frames, k, 3, 3))
+        cross[..., 0, 1], cross[..., 0, 2] = arm[..., 2], -arm[..., 1]
+        cross[..., 1, 0], cross[..., 1, 2] = -arm[..., 2], arm[..., 0]
+        cross[..., 2, 0], cross[..., 2, 1] = arm[..., 1], -arm[..., 0]
+        jacobian[:, : 3 * k, 3:6] = (cross * w_p[None, ..., None]).reshape(frames, 3 * k, 3)
+        spin = axes[:, None] * moves[targets.frame_joint][None, :, :, None]
+        jacobian[:, 3 * k :, 6:] = (spin * w_o[None, :, None]).transpose(0, 1, 3, 2).reshape(frames, 3 * m, n)
+        jacobian[:, 3 * k :, 3:6] = (eye[None] * w_o[..., None]).reshape(3 * m, 3)
+        off = rot.multiply(targets.orientations, rot.conjugate(quats[:, targets.frame_joint]))
+        residual = np.concatenate(
+            [
+                ((targets.positions - points) * w_p).reshape(frames, -1),
+                (rot.to_rotvec(off) * w_o).reshape(frames, -1),
+            ],
+            axis=1,
+        )
+        normal = np.einsum("tri,trj->tij", jacobian, jacobian, optimize=True)
+        gradient = np.einsum("tri,tr->ti", jacobian, residual)
+        normal[:, np.arange(6 + n), np.arange(6 + n)] += damping**2
+        normal[:, np.arange(6, 6 + n), np.arange(6, 6 + n)] += stay**2
+        gradient[:, 6:] += stay**2 * (start[:, 7:] - qpos[:, 7:])
+        step = np.linalg.solve(normal, gradient[..., None])[..., 0]
+        step = np.clip(step, -0.5, 0.5)
+        qpos[:, :3] += step[:, :3]
+        qpos[:, 3:7] = rot.normalize(rot.multiply(rot.from_rotvec(step[:, 3:6]), qpos[:, 3:7]))
+        qpos[:, 7:] += step[:, 6:]
+        if limits is not None:
+            qpos[:, 7:] = np.clip(qpos[:, 7:], limits[:, 0], limits[:, 1])
+    return qpos

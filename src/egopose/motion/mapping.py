@@ -1,0 +1,154 @@
+"""Which joint of a foreign skeleton plays which part of a human body.
+
+Only four words have to be recognised in the names (foot or ankle, hand or wrist, head, and a side); the rest follows
+from the tree: the knee is the ankle's parent, the chest the place where the arms meet, the hips where the legs meet.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+
+import numpy as np
+
+from egopose.errors import InputError
+from egopose.motion.skeleton import Skeleton
+
+SIDES = ("right", "left")
+#: Helper bones that stand in a limb's chain in some rigs and carry no joint of their own.
+_HELPER = re.compile(r"twist|share|roll|helper|nub", re.IGNORECASE)
+
+
+@dataclass(frozen=True)
+class BodyMap:
+    """Source joint index for each part of the body.
+
+    Args:
+        parts: part name -> joint index. Parts: ``hips``, ``neck``, ``head`` and for either side ``thigh shin foot
+            clavicle arm forearm hand`` as ``right_thigh``; ``right_toe`` where there is one.
+        spine: joint indices from the first spine joint to the chest (the parent of neck and arms), at least one.
+        unmapped: names of the source joints that play no part.
+    """
+
+    parts: dict[str, int]
+    spine: tuple[int, ...]
+    unmapped: tuple[str, ...]
+
+
+def side_of(name: str) -> str | None:
+    """``"left"``, ``"right"`` or None from a joint's name in any common convention (``L_Foot``, ``lfoot``, ``Foot_L``)."""
+    stripped = re.sub(r"^(cc_base_|mixamorig:?|bip\d*_?|b_|joint_|.*:)", "", name, flags=re.IGNORECASE)
+    if re.search(r"left", stripped, re.IGNORECASE):
+        return "left"
+    if re.search(r"right", stripped, re.IGNORECASE):
+        return "right"
+    if match := re.search(r"(?:^|[_.\s-])([lr])(?:[_.\s-]|$)", stripped, re.IGNORECASE):
+        return "left" if match[1].lower() == "l" else "right"
+    words = "foot|ankle|hand|wrist|hip|femur|tibia|toe|clavicle|humerus|radius|knee|elbow|shoulder|collar|thigh|shin|arm|leg"
+    if match := re.match(rf"([lr])(?:{words})", stripped, re.IGNORECASE):
+        return "left" if match[1].lower() == "l" else "right"
+    return None
+
+
+def identify(skeleton: Skeleton, overrides: dict[str, str] | None = None) -> BodyMap:
+    """Find the parts of a humanoid skeleton.
+
+    Args:
+        skeleton: any humanoid tree.
+        overrides: part -> joint name, for rigs whose names say too little.
+
+    Raises:
+        InputError: a part cannot be found, or two parts would share a joint; names the part and the joints there are.
+    """
+    overrides = overrides or {}
+    for part, name in overrides.items():
+        if name not in skeleton.names:
+            raise InputError(skeleton.name or "skeleton", f"mapping.{part}", f"there is no joint {name!r}")
+    parts: dict[str, int] = {part: skeleton.index(name) for part, name in overrides.items()}
+    for side in SIDES:
+        _limb(skeleton, parts, side, ("foot", "shin", "thigh"), ("ankle", "foot"))
+        _limb(skeleton, parts, side, ("hand", "forearm", "arm"), ("wrist", "hand"))
+    if "head" not in parts:
+        parts["head"] = _find(skeleton, ("head",), None, "head")
+    hips = parts.setdefault("hips", _common(skeleton, parts["left_thigh"], parts["right_thigh"]))
+    chest = _common(skeleton, parts["left_arm"], parts["right_arm"])
+    for side in SIDES:
+        chain = _between(skeleton, chest, parts[f"{side}_arm"])
+        if chain and f"{side}_clavicle" not in parts:
+            parts[f"{side}_clavicle"] = chain[-1]
+        if f"{side}_toe" not in parts:
+            toe = _toe(skeleton, parts[f"{side}_foot"])
+            if toe is not None:
+                parts[f"{side}_toe"] = toe
+    neck = _between(skeleton, chest, parts["head"])
+    if neck and "neck" not in parts:
+        parts["neck"] = neck[0]
+    path = _path(skeleton, chest)
+    trunk = _common(skeleton, hips, chest)
+    spine = tuple(i for i in path[path.index(trunk) + 1 :] if i not in parts.values()) or (chest,)
+    used = set(parts.values()) | set(spine)
+    if len(set(parts.values())) != len(parts):
+        raise InputError(skeleton.name or "skeleton", "mapping", f"one joint would play two parts: {_named(skeleton, parts)}")
+    unmapped = tuple(n for i, n in enumerate(skeleton.names) if i not in used)
+    return BodyMap(parts, spine, unmapped)
+
+
+def _limb(skeleton: Skeleton, parts: dict[str, int], side: str, roles: tuple[str, ...], words: tuple[str, ...]) -> None:
+    if f"{side}_{roles[0]}" not in parts:
+        parts[f"{side}_{roles[0]}"] = _find(skeleton, words, side, f"{side}_{roles[0]}")
+    for lower, upper in zip(roles, roles[1:], strict=False):
+        if f"{side}_{upper}" in parts:
+            continue
+        index = int(skeleton.parents[parts[f"{side}_{lower}"]])
+        while index > 0 and _HELPER.search(skeleton.names[index]):
+            index = int(skeleton.parents[index])
+        if index <= 0:
+            raise InputError(skeleton.name or "skeleton", f"mapping.{side}_{upper}", f"the {side} limb has too few joints")
+        parts[f"{side}_{upper}"] = index
+
+
+def _find(skeleton: Skeleton, words: tuple[str, ...], side: str | None, part: str) -> int:
+    """The first joint (nearest the root) that carries one of ``words`` (in order of preference) and the side."""
+    for word in words:
+        hits = [
+            i
+            for i, name in enumerate(skeleton.names)
+            if re.search(word, name, re.IGNORECASE) and side_of(name) == side and not _HELPER.search(name)
+        ]
+        if hits:
+            return min(hits, key=lambda i: len(_path(skeleton, i)))
+    raise InputError(
+        skeleton.name or "skeleton",
+        f"mapping.{part}",
+        f"no joint is called {' or '.join(words)}{f' on the {side}' if side else ''}; give mapping.{part}=NAME out of: "
+        + ", ".join(skeleton.names),
+    )
+
+
+def _toe(skeleton: Skeleton, foot: int) -> int | None:
+    children = [i for i in skeleton.children(foot) if not _HELPER.search(skeleton.names[i])]
+    children = [i for i in children if np.linalg.norm(skeleton.offsets[i]) > 0.02]
+    named = [i for i in children if re.search("toe|foot|ball", skeleton.names[i], re.IGNORECASE)]
+    return (named or children or [None])[0]  # type: ignore[list-item]
+
+
+def _path(skeleton: Skeleton, index: int) -> list[int]:
+    path = [index]
+    while (parent := int(skeleton.parents[path[-1]])) >= 0:
+        path.append(parent)
+    return path[::-1]
+
+
+def _common(skeleton: Skeleton, a: int, b: int) -> int:
+    common = [i for i, j in zip(_path(skeleton, a), _path(skeleton, b), strict=False) if i == j]
+    return common[-1]
+
+
+def _between(skeleton: Skeleton, top: int, bottom: int) -> list[int]:
+    """Joints strictly between an ancestor and its descendant."""
+    path = _path(skeleton, bottom)
+    return path[path.index(top) + 1 : -1] if top in path else []
+
+
+def _named(skeleton: Skeleton, parts: dict[str, int]) -> str:
+    return ", ".join(f"{p}={skeleton.names[i]}" for p, i in sorted(parts.items()))
