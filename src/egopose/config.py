@@ -1,0 +1,101 @@
+"""Where the configuration lies, and typed reading of it with errors that name file and field."""
+
+from __future__ import annotations
+
+import types
+import typing
+from collections.abc import Mapping
+from dataclasses import MISSING, fields
+from pathlib import Path
+from typing import Any, TypeVar, Union
+
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from egopose.errors import InputError
+
+T = TypeVar("T")
+
+
+def config_dir() -> Path:
+    """The folder of Hydra groups: inside the installed package, or ``conf/`` of the checkout it was installed from.
+
+    Raises:
+        InputError: neither is there.
+    """
+    package = Path(__file__).resolve().parent
+    for place in (package / "conf", package.parents[1] / "conf"):
+        if (place / "train.yaml").is_file():
+            return place
+    raise InputError(package / "conf", "train.yaml", "the configuration is missing: the installation is incomplete")
+
+
+def resolved(config: DictConfig) -> dict[str, Any]:
+    """The configuration as plain containers, every interpolation replaced.
+
+    Raises:
+        InputError: a value is missing (``???``) or an interpolation leads nowhere; names the field.
+    """
+    try:
+        out = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
+    except OmegaConfBaseException as error:
+        field = str(getattr(error, "full_key", "") or "?")
+        raise InputError("configuration", field, str(error).splitlines()[0]) from None
+    if not isinstance(out, dict):
+        raise InputError("configuration", "top level", "must be a mapping")
+    return {str(key): value for key, value in out.items()}
+
+
+def from_mapping(cls: type[T], values: Mapping[str, Any], source: str) -> T:
+    """Fill the dataclass ``cls`` from ``values``, converting numbers and lists to the annotated types.
+
+    ``...`` as a value counts as absent.
+
+    Raises:
+        InputError: a key is missing, unknown, or its value is of another kind; names ``source`` and key.
+    """
+    hints = typing.get_type_hints(cls)
+    known = {f.name: f for f in fields(cls)}  # type: ignore[arg-type]
+    if unknown := set(values) - set(known):
+        raise InputError(source, sorted(unknown)[0], f"is not a setting; there are {', '.join(known)}")
+    out = {}
+    for name, field in known.items():
+        value = values.get(name, ...)
+        if value is ...:
+            if field.default is MISSING and field.default_factory is MISSING:
+                raise InputError(source, name, "is missing")
+            continue
+        out[name] = convert(value, hints[name], source, name)
+    return cls(**out)
+
+
+def convert(value: Any, kind: Any, source: str, field: str) -> Any:
+    """``value`` as ``kind``: bool, int, float, str, tuples of them, any of them optional.
+
+    Raises:
+        InputError: it is something else; names ``source`` and ``field``.
+    """
+    origin = typing.get_origin(kind)
+    if origin in (Union, types.UnionType):
+        options = [option for option in typing.get_args(kind) if option is not type(None)]
+        if value is None and len(options) < len(typing.get_args(kind)):
+            return None
+        return convert(value, options[0], source, field)
+    if origin is tuple:
+        parts = typing.get_args(kind)
+        if not isinstance(value, (list, tuple)):
+            raise InputError(source, field, f"must be a list, not {value!r}")
+        if parts[-1] is Ellipsis:
+            parts = (parts[0],) * len(value)
+        if len(parts) != len(value):
+            raise InputError(source, field, f"must be {len(parts)} values, not {len(value)}")
+        return tuple(convert(v, p, source, field) for v, p in zip(value, parts, strict=True))
+    if kind is Any:
+        return value
+    if kind is float and isinstance(value, (int, float)) and not isinstance(value, bool):
+        return float(value)
+    if kind is int and isinstance(value, float) and value.is_integer():
+        return int(value)
+    if isinstance(value, kind) and not (kind is int and isinstance(value, bool)):
+        return value
+    raise InputError(source, field, f"must be {kind.__name__}, not {value!r}")

@@ -1,0 +1,304 @@
+"""The training loop: collect, estimate advantages, update, log, save; stops at a budget or at Ctrl-C and resumes."""
+
+from __future__ import annotations
+
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+from tensordict import TensorDictBase
+from torchrl.checkpoint import GlobalRNGState
+
+from egopose.config import from_mapping
+from egopose.errors import InputError
+from egopose.training import checkpoint as checkpoints
+from egopose.training import collectors
+from egopose.training.collectors import CollectorSettings
+from egopose.training.logging import ProgressLine, Scalars
+from egopose.training.ppo import PPO, TrainingDiverged
+
+Evaluation = Callable[[int], Mapping[str, float]]
+
+
+@dataclass(frozen=True)
+class LoopSettings:
+    """How long, and what is kept; see ``conf/train.yaml`` (``training``) and ``conf/algo``.
+
+    Args:
+        iterations: of collection and update.
+        steps_per_iteration: control steps over all worlds.
+        total_steps: stop at this many control steps, None for no limit besides ``iterations``.
+        max_seconds: stop before the iteration that would end later than this, counted from the start of this process's
+            training; None for no limit.
+        checkpoint_every: iterations.
+        keep_last: checkpoints kept besides the best.
+        evaluate_every: iterations; 0 for never.
+    """
+
+    iterations: int
+    steps_per_iteration: int
+    total_steps: int | None
+    max_seconds: float | None
+    checkpoint_every: int
+    keep_last: int
+    evaluate_every: int
+
+    @classmethod
+    def from_config(cls, values: Mapping[str, Any], source: str = "conf/train.yaml") -> LoopSettings:
+        """Raises InputError: a key is missing, unknown or out of range."""
+        settings = from_mapping(cls, values, source)
+        for name in ("iterations", "steps_per_iteration", "checkpoint_every", "keep_last"):
+            if getattr(settings, name) < 1:
+                raise InputError(source, name, f"must be at least 1, not {getattr(settings, name)}")
+        for name in ("total_steps", "max_seconds"):
+            if getattr(settings, name) is not None and getattr(settings, name) <= 0:
+                raise InputError(source, name, f"must be positive or null, not {getattr(settings, name)}")
+        return settings
+
+
+@dataclass
+class Counters:
+    """Where a run stands; a component of its checkpoints (``trainer_state``)."""
+
+    iteration: int = 0
+    frames: int = 0
+    seconds: float = 0.0
+    skipped_minibatches: int = 0
+    diverged_worlds: int = 0
+    score: float = 0.0
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """How training ended: ``reason`` is ``finished``, ``total_steps``, ``max_seconds`` or ``interrupted``."""
+
+    reason: str
+    iteration: int
+    frames: int
+    checkpoint: Path
+
+
+@dataclass
+class Run:
+    """All that a run is made of, and what of it goes into a checkpoint.
+
+    Args:
+        ppo: the learner.
+        collector: from :func:`egopose.training.collectors.build_collector`.
+        settings: see :class:`LoopSettings`.
+        collector_settings: threads.
+        folder: the run directory.
+        config: resolved, as plain containers; ``config["task"]["name"]`` names the task.
+        action_size: of the environment.
+    """
+
+    ppo: PPO
+    collector: Any
+    settings: LoopSettings
+    collector_settings: CollectorSettings
+    folder: Path
+    config: Mapping[str, Any]
+    action_size: int
+    counters: Counters = field(default_factory=Counters)
+
+    @property
+    def task(self) -> str:
+        return str(self.config["task"]["name"])
+
+    def checkpoint(self) -> checkpoints.RunCheckpoint:
+        """The components bound to this run's live objects."""
+        return checkpoints.RunCheckpoint(
+            {
+                **self.ppo.state(),
+                "transforms": _TransformState(self.collector),
+                "simulation": checkpoints.ComponentState(
+                    lambda: collectors.simulation_state(self.collector),
+                    lambda state: collectors.load_simulation_state(self.collector, state),
+                ),
+                "rng": checkpoints.ComponentState(GlobalRNGState().state_dict, GlobalRNGState().load_state_dict),
+                "trainer_state": vars(self.counters),
+                "config": dict(self.config),
+            }
+        )
+
+    def save(self) -> Path:
+        """Write a checkpoint named after the control steps so far, and drop those no longer kept."""
+        state = self.counters
+        metadata = checkpoints.metadata_of(self.task, self.action_size, state.iteration, state.frames, state.score)
+        kept = checkpoints.rotation(self.folder, self.settings.keep_last)
+        return kept.save(self.checkpoint(), step=state.frames, metadata=metadata)
+
+    def restore(self, path: str | Path) -> None:
+        """Take over everything from a checkpoint of a run with the same configuration.
+
+        Raises:
+            InputError: it is damaged, of another task, or does not fit; names the field.
+        """
+        metadata = checkpoints.verify(path)
+        checkpoints.require(metadata, path, task=self.task, action_size=self.action_size)
+        restored = self.checkpoint()
+        names = set(restored.components)
+        # The random generators last: loading the rest may draw from them.
+        restored.restore(path, names - {"rng", "config", "trainer_state"})
+        self.counters = Counters(**checkpoints.read_json(path, "trainer_state"))
+        restored.restore(path, {"rng"})
+        self.collector.update_policy_weights_()
+
+
+class _TransformState:
+    """The environment's transforms as a component with a ``state_dict``."""
+
+    def __init__(self, collector: Any) -> None:
+        self.collector = collector
+
+    def state_dict(self) -> Mapping[str, Any]:
+        return collectors.transform_state(self.collector)
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        collectors.load_transform_state(self.collector, state)
+
+
+def train(run: Run, loggers: Sequence[Scalars], evaluate: Evaluation | None = None) -> Outcome:
+    """Train until a budget is used up or a stop is asked for; always leaves a checkpoint of the last whole iteration.
+
+    Args:
+        run: fresh, or restored from a checkpoint.
+        loggers: get every iteration's figures.
+        evaluate: called every ``evaluate_every`` iterations with the iteration's number; its figures are logged under
+            ``evaluation/``, and its ``score``, if it gives one, decides which checkpoint is the best (otherwise the
+            mean episode length in training does).
+
+    Raises:
+        TrainingDiverged: see :meth:`PPO.update`; a checkpoint is saved before.
+    """
+    settings, counters = run.settings, run.counters
+    progress = ProgressLine(settings.iterations, counters.iteration, settings.max_seconds)
+    begin = time.monotonic()
+    saved: Path | None = None
+    slowest = 0.0
+    batches = iter(run.collector)
+    with stop_signals() as stop:
+        try:
+            while (reason := _end(settings, counters, time.monotonic() - begin + slowest, stop)) is None:
+                started = time.monotonic()
+                figures = iterate(run, batches)
+                if (
+                    evaluate is not None
+                    and settings.evaluate_every
+                    and counters.iteration % settings.evaluate_every == 0
+                ):
+                    result = dict(evaluate(counters.iteration))
+                    counters.score = result.get("score", counters.score)
+                    figures |= {f"evaluation/{name}": value for name, value in result.items()}
+                elif evaluate is None or not settings.evaluate_every:
+                    counters.score = figures.get("episode_length", counters.score)
+                for logger in loggers:
+                    logger.write(counters.frames, figures)
+                progress.update(counters.iteration, figures)
+                saved = run.save() if counters.iteration % settings.checkpoint_every == 0 else None
+                slowest = max(slowest, time.monotonic() - started)
+                counters.seconds += time.monotonic() - started
+        except TrainingDiverged as error:
+            raise TrainingDiverged(f"{error}; the state before is saved in {run.save()}") from None
+        finally:
+            progress.close()
+            for logger in loggers:
+                logger.close()
+    return Outcome(reason, counters.iteration, counters.frames, saved or run.save())
+
+
+def iterate(run: Run, batches: Iterator[TensorDictBase]) -> dict[str, float]:
+    """One iteration; returns its figures and moves the counters."""
+    threads, counters = run.collector_settings, run.counters
+    clock = [time.monotonic()]
+    collectors.set_threads(threads.threads)
+    batch = next(batches)
+    clock.append(time.monotonic())
+    collectors.set_threads(threads.update_threads)
+    rows = run.ppo.advantages(batch)
+    clock.append(time.monotonic())
+    try:
+        learning = run.ppo.update(rows)
+    finally:
+        collectors.set_threads(threads.threads)
+    run.collector.update_policy_weights_()
+    clock.append(time.monotonic())
+
+    counters.iteration += 1
+    counters.frames += batch.numel()
+    counters.skipped_minibatches += int(learning["skipped_minibatches"])
+    experience = experience_figures(batch)
+    counters.diverged_worlds += int(experience.get("diverged", 0))
+    return {
+        "iteration": float(counters.iteration),
+        **experience,
+        **learning,
+        "steps_per_s": batch.numel() / (clock[3] - clock[0]),
+        "seconds_collect": clock[1] - clock[0],
+        "seconds_gae": clock[2] - clock[1],
+        "seconds_update": clock[3] - clock[2],
+    }
+
+
+def experience_figures(batch: TensorDictBase) -> dict[str, float]:
+    """Figures of a batch ``[N, T]``.
+
+    ``reward`` and each of ``reward_terms``: mean a step. Of the episodes that ended in the batch: ``episode_length``
+    (frames survived, mean), ``falls`` (the fraction that ended before the time limit), ``episodes`` (how many).
+    ``diverged``: worlds whose physics broke.
+    """
+    after = batch["next"]
+    names = set(after.keys())
+    out = {"reward": float(after["reward"].mean())}
+    if "reward_terms" in names:
+        out |= {f"reward_{name}": float(term.mean()) for name, term in sorted(after["reward_terms"].items())}
+    ended = after["done"].squeeze(-1)
+    out["episodes"] = float(ended.sum())
+    if ended.any():
+        out["falls"] = float(after["terminated"].squeeze(-1)[ended].float().mean())
+        if "episode_step" in names:
+            out["episode_length"] = float(after["episode_step"].squeeze(-1)[ended].float().mean())
+    if "diverged" in names:
+        out["diverged"] = float(after["diverged"].sum())
+    return out
+
+
+@contextmanager
+def stop_signals() -> Iterator[threading.Event]:
+    """An event that Ctrl-C or SIGTERM sets; a second one interrupts at once. Plain event outside the main thread."""
+    event = threading.Event()
+    if threading.current_thread() is not threading.main_thread():
+        yield event
+        return
+
+    def ask(number: int, frame: FrameType | None) -> None:
+        if event.is_set():
+            raise KeyboardInterrupt
+        event.set()
+        print("\nstopping after this iteration; once more to stop at once", flush=True)
+
+    before = {number: signal.signal(number, ask) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield event
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def _end(settings: LoopSettings, counters: Counters, seconds_after_next: float, stop: threading.Event) -> str | None:
+    """Why no further iteration is begun, or None."""
+    if stop.is_set():
+        return "interrupted"
+    if counters.iteration >= settings.iterations:
+        return "finished"
+    if settings.total_steps is not None and counters.frames >= settings.total_steps:
+        return "total_steps"
+    if settings.max_seconds is not None and seconds_after_next > settings.max_seconds:
+        return "max_seconds"
+    return None

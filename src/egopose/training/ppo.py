@@ -1,0 +1,246 @@
+"""Proximal policy optimisation (Schulman et al. 2017) from TorchRL's GAE and ClipPPOLoss.
+
+A batch is what a collector yields: TensorDict ``[N, T]``, worlds by steps, time last. ``terminated`` (a fall)
+bootstraps nothing, ``truncated`` (the time limit) bootstraps from the critic's value of the state it was cut at.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from dataclasses import dataclass, fields
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule
+from torch import Tensor
+from torchrl.objectives import ClipPPOLoss
+from torchrl.objectives.value import GAE
+
+from egopose.config import from_mapping
+from egopose.errors import InputError
+
+
+class TrainingDiverged(RuntimeError):
+    """Minibatch after minibatch gave a loss or gradient that is not finite."""
+
+
+@dataclass(frozen=True)
+class PPOSettings:
+    """See ``conf/algo`` for values and their sources.
+
+    Args:
+        gamma: discount a step.
+        lmbda: GAE's lambda.
+        clip_epsilon: the ratio's clip.
+        entropy_coeff: weight of the entropy bonus; 0 for none.
+        epochs: passes over a batch.
+        minibatch_size: rows a gradient step; None for the full batch.
+        policy_lr: Adam's step size for the actor.
+        value_lr: Adam's step size for the critic.
+        policy_grad_norm: the actor's gradient is scaled down to this norm.
+        value_grad_norm: the same for the critic; None for no limit.
+        normalize_advantage: to zero mean and unit deviation over the batch.
+        target_kl: after each epoch the actor's step size is adapted to keep KL(old || new) near this; None to keep it.
+        policy_lr_range: bounds of the adapted step size.
+        max_nonfinite: gradient steps in a row that may be skipped for values that are not finite.
+    """
+
+    gamma: float
+    lmbda: float
+    clip_epsilon: float
+    entropy_coeff: float
+    epochs: int
+    minibatch_size: int | None
+    policy_lr: float
+    value_lr: float
+    policy_grad_norm: float
+    value_grad_norm: float | None
+    normalize_advantage: bool
+    target_kl: float | None
+    policy_lr_range: tuple[float, float]
+    max_nonfinite: int
+
+    @classmethod
+    def from_config(cls, values: Any, source: str = "conf/algo") -> PPOSettings:
+        """From a resolved config group; keys of other users are left alone.
+
+        Raises:
+            InputError: a key is missing or its value of the wrong kind or range; names it.
+        """
+        settings = from_mapping(cls, {f.name: values.get(f.name, ...) for f in fields(cls)}, source)
+        settings._check(source)
+        return settings
+
+    def _check(self, source: str) -> None:
+        for name in ("policy_lr", "value_lr", "policy_grad_norm", "clip_epsilon"):
+            if getattr(self, name) <= 0:
+                raise InputError(source, name, f"must be positive, not {getattr(self, name)}")
+        for name in ("gamma", "lmbda"):
+            if not 0 <= getattr(self, name) <= 1:
+                raise InputError(source, name, f"must lie in 0..1, not {getattr(self, name)}")
+        for name in ("epochs", "max_nonfinite"):
+            if getattr(self, name) < 1:
+                raise InputError(source, name, f"must be at least 1, not {getattr(self, name)}")
+        if self.minibatch_size is not None and self.minibatch_size < 2:
+            raise InputError(source, "minibatch_size", f"must be null or at least 2, not {self.minibatch_size}")
+
+
+class PPO:
+    """The learner: advantages, gradient steps, optimisers.
+
+    Args:
+        actor: a probabilistic module from observations to ``action``, its log-probability and distribution parameters.
+        critic: from observations to ``state_value [..., 1]``.
+        settings: see :class:`PPOSettings`.
+    """
+
+    def __init__(
+        self, actor: ProbabilisticTensorDictSequential, critic: TensorDictModule, settings: PPOSettings
+    ) -> None:
+        self.actor, self.critic, self.settings = actor, critic, settings
+        self.loss = ClipPPOLoss(
+            actor,
+            critic,
+            clip_epsilon=settings.clip_epsilon,
+            entropy_bonus=settings.entropy_coeff > 0,
+            entropy_coeff=settings.entropy_coeff if settings.entropy_coeff > 0 else None,
+            critic_coeff=1.0,
+            loss_critic_type="l2",
+        )
+        # `shifted=True`, TorchRL's default, is wrong where a row holds resets.
+        self.gae = GAE(
+            gamma=settings.gamma, lmbda=settings.lmbda, value_network=critic, shifted=False, deactivate_vmap=True
+        )
+        # Two sets of parameters, two step sizes: a module that both networks shared would be stepped twice.
+        self.policy_parameters = [p for p in actor.parameters() if p.requires_grad]
+        self.value_parameters = [p for p in critic.parameters() if p.requires_grad]
+        if {id(p) for p in self.policy_parameters} & {id(p) for p in self.value_parameters}:
+            raise ValueError("actor and critic share parameters; each needs its own")
+        self.policy_optimizer = torch.optim.Adam(self.policy_parameters, lr=settings.policy_lr)
+        self.value_optimizer = torch.optim.Adam(self.value_parameters, lr=settings.value_lr)
+        self._nonfinite_in_a_row = 0
+
+    @torch.no_grad()
+    def advantages(self, batch: TensorDictBase) -> TensorDictBase:
+        """Rows for the update: ``[N * T]`` with what the losses read, ``advantage`` and ``value_target`` among it.
+
+        Args:
+            batch: ``[N, T]`` as collected.
+        """
+        self.gae(batch)
+        names = [*self.loss.in_keys, *self.actor.out_keys, "advantage", "value_target"]
+        rows = batch.select(*[n for n in names if _root(n) != "next"], strict=False).reshape(-1)
+        advantage = rows["advantage"]
+        rows["state_value"] = rows["value_target"] - advantage
+        if self.settings.normalize_advantage:
+            rows["advantage"] = (advantage - advantage.mean()) / advantage.std().clamp_min(1e-6)
+        return rows
+
+    def update(self, rows: TensorDictBase) -> dict[str, float]:
+        """All epochs over ``rows [B]``; returns the iteration's figures.
+
+        Raises:
+            TrainingDiverged: more than ``max_nonfinite`` gradient steps in a row had to be skipped.
+        """
+        sums: dict[str, list[Tensor]] = defaultdict(list)
+        explained = _explained_variance(rows)
+        skipped, kl = 0, 0.0
+        for epoch in range(self.settings.epochs):
+            for index in self._minibatches(len(rows)):
+                figures = self._gradient_step(rows if index is None else rows[index])
+                if figures is None:
+                    skipped += 1
+                    continue
+                for name, value in figures.items():
+                    sums[name].append(value)
+            if self.settings.target_kl is not None or epoch == self.settings.epochs - 1:
+                kl = self.divergence(rows)
+                self._adapt_step_size(kl)
+        out = {name: float(torch.stack(values).mean()) for name, values in sums.items()}
+        return out | {
+            "kl": kl,
+            "explained_variance": explained,
+            "policy_lr": self.policy_optimizer.param_groups[0]["lr"],
+            "skipped_minibatches": float(skipped),
+        }
+
+    @torch.no_grad()
+    def divergence(self, rows: TensorDictBase) -> float:
+        """Mean KL(policy that collected ``rows`` || policy now), in closed form."""
+        old = self.actor.build_dist_from_params(rows)
+        new = self.actor.get_dist(rows.select(*self.actor.in_keys))
+        return float(torch.distributions.kl_divergence(old, new).mean())
+
+    def state(self) -> dict[str, Any]:
+        """The objects whose ``state_dict`` a checkpoint keeps, by component name."""
+        return {
+            "policy": self.actor,
+            "critic": self.critic,
+            "policy_optimizer": self.policy_optimizer,
+            "value_optimizer": self.value_optimizer,
+        }
+
+    def _minibatches(self, count: int) -> list[Tensor | None]:
+        size = self.settings.minibatch_size
+        if size is None or size >= count:
+            return [None]
+        parts = torch.randperm(count).split(size)
+        # A short rest would be a gradient step of its own, as long as the others and noisier.
+        return list(parts if len(parts[-1]) == size else parts[:-1])
+
+    def _gradient_step(self, rows: TensorDictBase) -> dict[str, Tensor] | None:
+        """One step of critic and actor, or None where loss or gradient was not finite and nothing was stepped."""
+        losses = self.loss(rows)
+        policy_loss = losses["loss_objective"] + losses.get("loss_entropy", 0.0)
+        self.policy_optimizer.zero_grad()
+        self.value_optimizer.zero_grad()
+        # The networks share nothing, so one backward pass gives both gradients, and the order of the steps is the
+        # paper's: value, then policy.
+        (policy_loss + losses["loss_critic"]).backward()
+        value_limit = self.settings.value_grad_norm
+        value_norm = torch.nn.utils.clip_grad_norm_(
+            self.value_parameters, float("inf") if value_limit is None else value_limit
+        )
+        policy_norm = torch.nn.utils.clip_grad_norm_(self.policy_parameters, self.settings.policy_grad_norm)
+        if not torch.isfinite(policy_norm + value_norm + policy_loss + losses["loss_critic"]):
+            self._nonfinite_in_a_row += 1
+            if self._nonfinite_in_a_row > self.settings.max_nonfinite:
+                raise TrainingDiverged(
+                    f"{self._nonfinite_in_a_row} gradient steps in a row had a loss or gradient that is not finite "
+                    f"(policy loss {policy_loss.item():g}, value loss {losses['loss_critic'].item():g}); "
+                    "lower algo.policy_lr or look for non-finite observations"
+                )
+            return None
+        self._nonfinite_in_a_row = 0
+        self.value_optimizer.step()
+        self.policy_optimizer.step()
+        return {
+            "policy_loss": policy_loss.detach(),
+            "value_loss": losses["loss_critic"].detach(),
+            "clip_fraction": losses["clip_fraction"],
+            "policy_grad_norm": policy_norm,
+            "value_grad_norm": value_norm,
+        }
+
+    def _adapt_step_size(self, kl: float) -> None:
+        """The actor's step size follows the divergence (Rudin et al. 2022, "Learning to walk in minutes")."""
+        target = self.settings.target_kl
+        if target is None:
+            return
+        low, high = self.settings.policy_lr_range
+        for group in self.policy_optimizer.param_groups:
+            if kl > 2 * target:
+                group["lr"] = max(low, group["lr"] / 1.5)
+            elif kl < target / 2:
+                group["lr"] = min(high, group["lr"] * 1.5)
+
+
+def _root(key: Any) -> Any:
+    return key[0] if isinstance(key, tuple) else key
+
+
+def _explained_variance(rows: TensorDictBase) -> float:
+    """1 - var(target - value) / var(target), of the critic before the update."""
+    target, value = rows["value_target"], rows["state_value"]
+    return float(1 - (target - value).var() / target.var().clamp_min(1e-12))
