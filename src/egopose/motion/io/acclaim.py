@@ -1,8 +1,8 @@
 """Acclaim: a skeleton (ASF) and its motion (AMC), as CMU's mocap library has them.
 
 A bone's angles act in its own axis frame C: local rotation = C Rz Ry Rx C^-1 for ``dof rx ry rz``. Turning the hinge
-axes into C e_k says the same, so every value of the file stays one coordinate of qpos. A bone starts where its parent
-ends; its joint stands at the start.
+axes into C e_k says the same, so a value of the file is a coordinate of qpos (of equal triples of angles the continuous
+one). A bone starts where its parent ends; its joint stands at the start.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 from egopose.errors import InputError
 from egopose.motion import rotations as rot
 from egopose.motion.io._files import MAX_JOINTS, excerpt, read_text
-from egopose.motion.io.frames import up_rotation
+from egopose.motion.io.frames import continuous_euler, up_rotation
 from egopose.motion.motion import Motion
 from egopose.motion.rotations import Array
 from egopose.motion.skeleton import Dof, Joint, Skeleton
@@ -72,9 +72,11 @@ def read_amc(path: str | Path, *, asf: str | Path | None = None, fps: float = 12
     scale = np.pi / 180.0 if degrees else 1.0
     root = frames[:, : len(skeleton_file.root_order)]
     position, quat = _root_pose(skeleton_file, root, scale)
-    values = frames[:, [c for c, _ in dof_columns]] * np.array(
-        [skeleton_file.metres if s else scale for _, s in dof_columns]
-    )
+    factors = np.array([skeleton_file.metres if is_length else scale for _, is_length in dof_columns])
+    values = frames[:, [column for column, _ in dof_columns]] * factors
+    for joint, columns_of_joint in zip(skeleton.joints, skeleton.dof_slices, strict=True):
+        if [d.kind for d in joint.dofs] == ["hinge"] * 3:
+            values[:, columns_of_joint] = continuous_euler(values[:, columns_of_joint])
     qpos = np.concatenate([position, rot.continuous(quat), values], axis=1)
     meta = {
         "format": "amc",
@@ -238,7 +240,8 @@ def _bone(path: Path, number: int, fields: dict[str, tuple[int, list[str]]], deg
 def _parse_root(
     path: Path, lines: list[tuple[int, list[str]]], degrees: bool
 ) -> tuple[tuple[str, ...], Rotation, Array]:
-    order, axis, number_axis = ("tx", "ty", "tz", "rx", "ry", "rz"), "XYZ", lines[0][0]
+    order: tuple[str, ...] = ("tx", "ty", "tz", "rx", "ry", "rz")
+    axis, number_axis = "XYZ", lines[0][0]
     position, orientation = np.zeros(3), ["0", "0", "0"]
     for number, words in lines:
         key = words[0].lower()

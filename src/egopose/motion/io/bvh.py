@@ -1,7 +1,8 @@
 """BVH: any skeleton, any channel order, 3 or 6 channels a joint, any up axis and unit.
 
-A joint's rotation channels become hinges in the file's order (of the equal triples of angles, the continuous ones). Position channels replace the joint's OFFSET, as exporters
-mean them; where they stay constant they become the offset, else slides before the hinges.
+A joint's rotation channels become hinges in the file's order; of equal triples of angles the continuous ones are taken.
+Position channels replace the joint's OFFSET, as exporters mean them; where they stay constant they become the offset,
+else slides before the hinges.
 """
 
 from __future__ import annotations
@@ -148,7 +149,8 @@ def _assemble(
 
 
 def _scaled(tips: list[tuple[float, float, float]], metres: float) -> tuple[tuple[float, float, float], ...]:
-    return tuple(_triple(metres * np.array(t)) for t in tips)
+    """End Sites in metres; those of no length only close a branch and say nothing."""
+    return tuple(_triple(metres * np.array(t)) for t in tips if any(t))
 
 
 def _triple(vector: Array) -> tuple[float, float, float]:

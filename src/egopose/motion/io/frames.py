@@ -44,13 +44,13 @@ def euler_angles(quats: Array, sequence: str) -> Array:
 
 
 def continuous_euler(angles: Array) -> Array:
-    """The same rotations without jumps: of each frame's Euler triples ``[T, 3]`` (rad) the one nearest to the last frame's.
+    """The same rotations without jumps: of each frame's Euler triples ``[T, 3]`` (rad) the one nearest to the last.
 
     Holds for three hinges about axes at right angles to each other, whatever the axes.
     """
     first = angles
     second = np.stack([first[:, 0] + np.pi, np.pi - first[:, 1], first[:, 2] + np.pi], axis=-1)
-    # A rotation has two triples and their turns by 2 pi. The cost of changing triple is the same from either, so each step decides for itself.
+    # A rotation has two triples, and their turns by 2 pi. Changing costs the same from either: each step decides alone.
     stay, change = _turn(first[1:] - first[:-1]), _turn(second[1:] - first[:-1])
     flips = np.concatenate([[0], np.cumsum(change.sum(-1) < stay.sum(-1))]) % 2 == 1
     return np.unwrap(np.where(flips[:, None], second, first), axis=0)

@@ -1,0 +1,130 @@
+"""AMASS-style ``.npz``: root translation and axis-angle poses of an SMPL, SMPL-H or SMPL-X body, z up, metres.
+
+The 22 joints all three share are read; fingers, jaw and eyes are left out and counted in ``meta``. The files hold no
+bone lengths (the body models that do are under licence), so a plain adult's of round figures are used unless given.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from egopose.errors import InputError
+from egopose.motion import rotations as rot
+from egopose.motion.io._npz import read_arrays
+from egopose.motion.io.frames import euler_angles
+from egopose.motion.motion import Motion
+from egopose.motion.rotations import Array
+from egopose.motion.skeleton import Joint, Skeleton, hinges
+
+# name, parent, offset in the T-pose (x left, y up, z forward; m), hinge order. The middle hinge is the twist, which stays
+# furthest from a quarter turn: about y for what stands or hangs along it, about x for arms.
+_BODY = (
+    ("pelvis", "", (0.0, -0.22, 0.03), ""),
+    ("left_hip", "pelvis", (0.07, -0.09, -0.01), "zyx"),
+    ("right_hip", "pelvis", (-0.07, -0.09, -0.01), "zyx"),
+    ("spine1", "pelvis", (0.0, 0.12, -0.03), "zyx"),
+    ("left_knee", "left_hip", (0.03, -0.39, 0.0), "zyx"),
+    ("right_knee", "right_hip", (-0.03, -0.39, 0.0), "zyx"),
+    ("spine2", "spine1", (0.0, 0.13, 0.0), "zyx"),
+    ("left_ankle", "left_knee", (-0.01, -0.40, -0.04), "zyx"),
+    ("right_ankle", "right_knee", (0.01, -0.40, -0.04), "zyx"),
+    ("spine3", "spine2", (0.0, 0.06, 0.02), "zyx"),
+    ("left_foot", "left_ankle", (0.03, -0.06, 0.12), "zyx"),
+    ("right_foot", "right_ankle", (-0.03, -0.06, 0.12), "zyx"),
+    ("neck", "spine3", (0.0, 0.21, -0.04), "zyx"),
+    ("left_collar", "spine3", (0.08, 0.12, -0.03), "zxy"),
+    ("right_collar", "spine3", (-0.08, 0.12, -0.03), "zxy"),
+    ("head", "neck", (0.0, 0.09, 0.05), "zyx"),
+    ("left_shoulder", "left_collar", (0.10, 0.04, -0.01), "zxy"),
+    ("right_shoulder", "right_collar", (-0.10, 0.04, -0.01), "zxy"),
+    ("left_elbow", "left_shoulder", (0.26, -0.01, -0.03), "zxy"),
+    ("right_elbow", "right_shoulder", (-0.26, -0.01, -0.03), "zxy"),
+    ("left_wrist", "left_elbow", (0.25, 0.01, 0.0), "zxy"),
+    ("right_wrist", "right_elbow", (-0.25, 0.01, 0.0), "zxy"),
+)
+_NAMES = [row[0] for row in _BODY]
+_TIPS = {
+    "head": ((0.0, 0.16, 0.02),),
+    "left_foot": ((0.0, 0.0, 0.07),),
+    "right_foot": ((0.0, 0.0, 0.07),),
+    "left_wrist": ((0.18, 0.0, 0.0),),
+    "right_wrist": ((-0.18, 0.0, 0.0),),
+}
+_WIDTHS = {66: "body", 72: "SMPL", 156: "SMPL-H", 165: "SMPL-X"}
+_RATES = ("mocap_framerate", "mocap_frame_rate", "fps")
+
+
+def read_amass(path: str | Path, *, joints: ArrayLike | None = None) -> Motion:
+    """Read an AMASS-style file: ``poses [T, 66 | 72 | 156 | 165]`` (rad), ``trans [T, 3]`` (m), ``mocap_framerate``.
+
+    Args:
+        path: the file.
+        joints: ``[22, 3]`` positions of the body's joints in its T-pose (m, y up, as SMPL's regressor gives them for
+            the subject's shape); by default a plain adult's.
+
+    Raises:
+        InputError: an array missing, of another shape, not finite, or of absurd size.
+    """
+    path = Path(path)
+    arrays = read_arrays(path, ("poses", "trans", *_RATES))
+    for name in ("poses", "trans"):
+        if name not in arrays:
+            raise InputError(path, name, "missing: an AMASS file holds poses, trans and mocap_framerate")
+        array = arrays[name]
+        if array.ndim != 2 or array.dtype.kind != "f" or not len(array):
+            raise InputError(path, name, f"must be [T, n] floats, got {array.dtype} {array.shape}")
+        bad = ~(np.abs(array) < 1e4).all(axis=1)
+        if bad.any():
+            raise InputError(path, name, f"frame {int(np.argmax(bad))} is not finite or absurdly large")
+    poses, trans = arrays["poses"].astype(np.float64), arrays["trans"].astype(np.float64)
+    if poses.shape[1] not in _WIDTHS:
+        raise InputError(path, "poses", f"{poses.shape[1]} columns; known are {', '.join(map(str, _WIDTHS))}")
+    if trans.shape != (len(poses), 3):
+        raise InputError(path, "trans", f"shape {trans.shape}, poses have {len(poses)} frames")
+    rest = _rest_positions() if joints is None else np.asarray(joints, dtype=np.float64)
+    if rest.shape != (len(_BODY), 3) or not np.isfinite(rest).all():
+        raise InputError(path, "option joints", f"must be [{len(_BODY)}, 3] finite positions, got {rest.shape}")
+    skeleton = _skeleton(rest)
+    quats = rot.from_rotvec(poses[:, :66].reshape(len(poses), len(_BODY), 3))
+    columns = [trans + rest[0], rot.continuous(quats[:, 0])]
+    columns += [euler_angles(quats[:, i], _BODY[i][3]) for i in range(1, len(_BODY))]
+    meta = {
+        "format": "amass",
+        "source": path.name,
+        "unit": "m",
+        "unit_metres": 1.0,
+        "up": "z",
+        "body_model": _WIDTHS[poses.shape[1]],
+        "dropped_columns": poses.shape[1] - 66,
+        "bone_lengths": "plain adult" if joints is None else "given",
+    }
+    return Motion(skeleton, np.concatenate(columns, axis=1), _rate(path, arrays), name=path.stem, meta=meta)
+
+
+def _rate(path: Path, arrays: dict[str, np.ndarray]) -> float:
+    for name in _RATES:
+        if name in arrays:
+            value = arrays[name]
+            if value.size != 1 or value.dtype.kind not in "fiu" or not 0.1 <= float(value.reshape(())) <= 1e5:
+                raise InputError(path, name, f"{str(value)[:40]} is not a frame rate")
+            return float(value.reshape(()))
+    raise InputError(path, _RATES[0], "missing: the frame rate is not said")
+
+
+def _rest_positions() -> Array:
+    positions = np.zeros((len(_BODY), 3))
+    for i, (_, parent, offset, _) in enumerate(_BODY):
+        positions[i] = np.array(offset) + (positions[_NAMES.index(parent)] if parent else 0.0)
+    return positions
+
+
+def _skeleton(rest: Array) -> Skeleton:
+    joints = []
+    for i, (name, parent, _, axes) in enumerate(_BODY):
+        up = _NAMES.index(parent) if parent else -1
+        x, y, z = rest[i] - rest[up] if parent else np.zeros(3)
+        joints.append(Joint(name, up, (float(x), float(y), float(z)), hinges(axes), _TIPS.get(name, ())))
+    return Skeleton(tuple(joints), name="smpl")

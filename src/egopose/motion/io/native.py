@@ -1,0 +1,156 @@
+"""The project's own clip: an ``.npz`` with a JSON header and plain arrays, exact to the bit, no pickle."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from egopose.errors import InputError
+from egopose.motion.io._files import MAX_JOINTS
+from egopose.motion.io._npz import read_arrays
+from egopose.motion.motion import Motion
+from egopose.motion.skeleton import Dof, Joint, Skeleton
+
+FORMAT, VERSION = "egopose.motion", 1
+
+
+def write_native(motion: Motion, path: str | Path, *, dtype: str = "float64") -> None:
+    """Write a clip; ``dtype="float32"`` halves it at about 1e-7 of each value.
+
+    Arrays: ``header`` (UTF-8 JSON as uint8: format, version, name, fps, skeleton, contact names, meta), ``qpos
+    [T, nq]``, and ``contacts [T, k]``, ``torques [T, nv - 6]`` where the motion has them.
+
+    Raises:
+        ValueError: another ``dtype``, or ``meta`` that JSON cannot say.
+    """
+    if dtype not in ("float32", "float64"):
+        raise ValueError(f"dtype must be float32 or float64, got {dtype!r}")
+    header = {
+        "format": FORMAT,
+        "version": VERSION,
+        "name": motion.name,
+        "fps": motion.fps,
+        "skeleton": skeleton_to_json(motion.skeleton),
+        "contact_names": list(motion.contact_names),
+        "meta": motion.meta,
+    }
+    try:
+        text = json.dumps(header, allow_nan=False)
+    except TypeError as error:
+        raise ValueError(f"meta holds what JSON cannot say: {error}") from error
+    arrays = {"header": np.frombuffer(text.encode(), dtype=np.uint8), "qpos": motion.qpos.astype(dtype)}
+    if motion.contacts is not None:
+        arrays["contacts"] = np.asarray(motion.contacts, dtype=bool)
+    if motion.torques is not None:
+        arrays["torques"] = np.asarray(motion.torques, dtype=dtype)
+    with Path(path).open("wb") as stream:
+        np.savez_compressed(stream, **arrays)  # type: ignore[arg-type]  # the stub takes allow_pickle for an array
+
+
+def read_native(path: str | Path) -> Motion:
+    """Read a clip written by :func:`write_native`.
+
+    Raises:
+        InputError: names the file, the field of the header or the array, and the cause.
+    """
+    path = Path(path)
+    arrays = read_arrays(path, ("header", "qpos", "contacts", "torques"))
+    if "header" not in arrays or arrays["header"].dtype != np.uint8 or arrays["header"].ndim != 1:
+        raise InputError(path, "header", "missing or not bytes: not a clip of this project")
+    try:
+        header = json.loads(arrays["header"].tobytes().decode("utf-8"))
+    except (ValueError, RecursionError) as error:
+        raise InputError(path, "header", f"not JSON: {error}") from error
+    if not isinstance(header, dict) or header.get("format") != FORMAT:
+        raise InputError(path, "header.format", f"is not {FORMAT!r}")
+    if header.get("version") != VERSION:
+        raise InputError(path, "header.version", f"{header.get('version')!r:.40}; this program reads {VERSION}")
+    qpos = arrays.get("qpos")
+    if qpos is None or qpos.dtype not in (np.float32, np.float64):
+        raise InputError(path, "qpos", "missing or not float32 or float64")
+    for label, kind in (("contacts", "b"), ("torques", "f")):
+        if label in arrays and (arrays[label].dtype.kind != kind or arrays[label].ndim != 2):
+            raise InputError(path, label, f"wrong type or shape: {arrays[label].dtype} {arrays[label].shape}")
+    skeleton = _checked(path, "header.skeleton", lambda: skeleton_from_json(header["skeleton"]))
+    if "torques" in arrays and arrays["torques"].shape[1] != skeleton.n_dofs:
+        raise InputError(
+            path, "torques", f"{arrays['torques'].shape[1]} columns for {skeleton.n_dofs} degrees of freedom"
+        )
+    meta = header.get("meta", {})
+    if not isinstance(meta, dict):
+        raise InputError(path, "header.meta", "is not an object")
+    torques = arrays.get("torques")
+    return _checked(
+        path,
+        "qpos",
+        lambda: Motion(
+            skeleton,
+            qpos,
+            float(header["fps"]),
+            name=str(header["name"]),
+            contacts=arrays.get("contacts"),
+            contact_names=tuple(str(n) for n in header["contact_names"]),
+            torques=None if torques is None else torques.astype(np.float64),
+            meta=meta,
+        ),
+    )
+
+
+def skeleton_to_json(skeleton: Skeleton) -> dict[str, Any]:
+    """The skeleton as JSON values; :func:`skeleton_from_json` turns it back, equal."""
+    joints = [
+        {
+            "name": j.name,
+            "parent": j.parent,
+            "offset": list(j.offset),
+            "dofs": [[d.kind, *d.axis] for d in j.dofs],
+            "tips": [list(t) for t in j.tips],
+        }
+        for j in skeleton.joints
+    ]
+    return {"name": skeleton.name, "joints": joints}
+
+
+def skeleton_from_json(value: Any) -> Skeleton:
+    """Raises KeyError, TypeError or ValueError on what is no skeleton."""
+    if len(value["joints"]) > MAX_JOINTS:
+        raise ValueError(f"{len(value['joints'])} joints; at most {MAX_JOINTS}")
+    joints = tuple(
+        Joint(
+            str(j["name"]),
+            int(j["parent"]),
+            _vector(j["offset"]),
+            tuple(_dof(d) for d in j["dofs"]),
+            tuple(_vector(t) for t in j["tips"]),
+        )
+        for j in value["joints"]
+    )
+    return Skeleton(joints, name=str(value["name"]))
+
+
+def _dof(value: Any) -> Dof:
+    kind, *axis = value
+    vector = _vector(axis)
+    if kind not in ("hinge", "slide") or abs(np.linalg.norm(vector) - 1.0) > 1e-6:
+        raise ValueError(f"degree of freedom {value!r:.80} is no hinge or slide with a unit axis")
+    return Dof(kind, vector)
+
+
+def _vector(value: Any) -> tuple[float, float, float]:
+    x, y, z = (float(v) for v in value)
+    if not np.isfinite([x, y, z]).all():
+        raise ValueError(f"vector {value!r:.80} is not finite")
+    return x, y, z
+
+
+def _checked(path: Path, field: str, make: Any) -> Any:
+    """What ``make`` gives; its complaints about values become an InputError on ``field``."""
+    try:
+        return make()
+    except KeyError as error:
+        raise InputError(path, field, f"key {error} is missing") from error
+    except (TypeError, ValueError, OverflowError) as error:
+        raise InputError(path, field, str(error)) from error
