@@ -126,7 +126,15 @@ class HumanoidConfig:
 
 
 _FLOATS = (
-    "ankle_height toe_height heel_length toe_overhang foot_width total_mass reference_mass kd_ratio armature".split()
+    "ankle_height",
+    "toe_height",
+    "heel_length",
+    "toe_overhang",
+    "foot_width",
+    "total_mass",
+    "reference_mass",
+    "kd_ratio",
+    "armature",
 )
 
 

@@ -92,7 +92,43 @@ def solve(
     return np.concatenate(chunks)
 
 
-def _part(targets: Targets, frames: slice) -> Targets:
+def solve_in_time(skeleton: Skeleton, start: Array, targets: Targets, limits: Array | None = None) -> Array:
+    """:func:`solve`, then again for frames that ended worse than a neighbour's solution lets them be.
+
+    A frame can be caught in a local minimum (a wrong branch of three hinges); its neighbour seldom is at the same time.
+    """
+    qpos = solve(skeleton, start, targets, limits)
+    cost = _cost(skeleton, qpos, targets)
+    for shift in (1, -1) * 4:
+        bad = np.flatnonzero(cost > _STUCK**2)
+        neighbour = bad + shift
+        inside = (neighbour >= 0) & (neighbour < len(qpos))
+        bad, neighbour = bad[inside], neighbour[inside]
+        if not len(bad):
+            break
+        moved = qpos[neighbour].copy()
+        again = solve(skeleton, moved, _part(targets, bad), limits)
+        new_cost = _cost(skeleton, again, _part(targets, bad))
+        better = new_cost < cost[bad]
+        qpos[bad[better]], cost[bad[better]] = again[better], new_cost[better]
+    return qpos
+
+
+#: Weighted root of the summed squared distances (m) above which a frame is tried again from its neighbours.
+_STUCK = 0.05
+
+
+def _cost(skeleton: Skeleton, qpos: Array, targets: Targets) -> Array:
+    """``[T]`` weighted squared distance of all points and frames, m^2."""
+    positions, quats = forward_kinematics(skeleton, qpos)
+    points = positions[:, targets.point_joint] + rot.rotate(quats[:, targets.point_joint], targets.point_offset[None])
+    off = rot.to_rotvec(rot.multiply(targets.orientations, rot.conjugate(quats[:, targets.frame_joint])))
+    return np.sum(((targets.positions - points) * targets.position_weight[:, None]) ** 2, axis=(1, 2)) + np.sum(
+        (off * targets.orientation_weight[:, None]) ** 2, axis=(1, 2)
+    )
+
+
+def _part(targets: Targets, frames: slice | np.ndarray) -> Targets:
     return Targets(
         targets.point_joint,
         targets.point_offset,
@@ -105,7 +141,13 @@ def _part(targets: Targets, frames: slice) -> Targets:
 
 
 def _solve(
-    skeleton: Skeleton, start: Array, targets: Targets, limits: Array | None, iterations: int, damping: float, stay: float
+    skeleton: Skeleton,
+    start: Array,
+    targets: Targets,
+    limits: Array | None,
+    iterations: int,
+    damping: float,
+    stay: float,
 ) -> Array:
     moves, n = _moves(skeleton), skeleton.n_dofs
     qpos, frames = start.copy(), len(start)
@@ -113,7 +155,9 @@ def _solve(
     k, m = len(targets.point_joint), len(targets.frame_joint)
     for _ in range(iterations):
         positions, quats = forward_kinematics(skeleton, qpos)
-        points = positions[:, targets.point_joint] + rot.rotate(quats[:, targets.point_joint], targets.point_offset[None])
+        points = positions[:, targets.point_joint] + rot.rotate(
+            quats[:, targets.point_joint], targets.point_offset[None]
+        )
         axes = _hinge_axes(skeleton, qpos, quats)
         origins = positions[:, skeleton.dof_joint]
         jacobian = np.zeros((frames, 3 * (k + m), 6 + n))

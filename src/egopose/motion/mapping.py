@@ -6,6 +6,7 @@ from the tree: the knee is the ankle's parent, the chest the place where the arm
 
 from __future__ import annotations
 
+import itertools
 import re
 from dataclasses import dataclass
 
@@ -17,6 +18,10 @@ from egopose.motion.skeleton import Skeleton
 SIDES = ("right", "left")
 #: Helper bones that stand in a limb's chain in some rigs and carry no joint of their own.
 _HELPER = re.compile(r"twist|share|roll|helper|nub", re.IGNORECASE)
+
+_LIMB_WORDS = (
+    "foot|ankle|hand|wrist|hip|femur|tibia|toe|clavicle|humerus|radius|knee|elbow|shoulder|collar|thigh|shin|arm|leg"
+)
 
 
 @dataclass(frozen=True)
@@ -36,7 +41,7 @@ class BodyMap:
 
 
 def side_of(name: str) -> str | None:
-    """``"left"``, ``"right"`` or None from a joint's name in any common convention (``L_Foot``, ``lfoot``, ``Foot_L``)."""
+    """``"left"``, ``"right"`` or None from a joint's name in any common convention (``L_Foot lfoot Foot_L``)."""
     stripped = re.sub(r"^(cc_base_|mixamorig:?|bip\d*_?|b_|joint_|.*:)", "", name, flags=re.IGNORECASE)
     if re.search(r"left", stripped, re.IGNORECASE):
         return "left"
@@ -44,8 +49,7 @@ def side_of(name: str) -> str | None:
         return "right"
     if match := re.search(r"(?:^|[_.\s-])([lr])(?:[_.\s-]|$)", stripped, re.IGNORECASE):
         return "left" if match[1].lower() == "l" else "right"
-    words = "foot|ankle|hand|wrist|hip|femur|tibia|toe|clavicle|humerus|radius|knee|elbow|shoulder|collar|thigh|shin|arm|leg"
-    if match := re.match(rf"([lr])(?:{words})", stripped, re.IGNORECASE):
+    if match := re.match(rf"([lr])(?:{_LIMB_WORDS})", stripped, re.IGNORECASE):
         return "left" if match[1].lower() == "l" else "right"
     return None
 
@@ -88,7 +92,9 @@ def identify(skeleton: Skeleton, overrides: dict[str, str] | None = None) -> Bod
     spine = tuple(i for i in path[path.index(trunk) + 1 :] if i not in parts.values()) or (chest,)
     used = set(parts.values()) | set(spine)
     if len(set(parts.values())) != len(parts):
-        raise InputError(skeleton.name or "skeleton", "mapping", f"one joint would play two parts: {_named(skeleton, parts)}")
+        raise InputError(
+            skeleton.name or "skeleton", "mapping", f"one joint would play two parts: {_named(skeleton, parts)}"
+        )
     unmapped = tuple(n for i, n in enumerate(skeleton.names) if i not in used)
     return BodyMap(parts, spine, unmapped)
 
@@ -96,14 +102,16 @@ def identify(skeleton: Skeleton, overrides: dict[str, str] | None = None) -> Bod
 def _limb(skeleton: Skeleton, parts: dict[str, int], side: str, roles: tuple[str, ...], words: tuple[str, ...]) -> None:
     if f"{side}_{roles[0]}" not in parts:
         parts[f"{side}_{roles[0]}"] = _find(skeleton, words, side, f"{side}_{roles[0]}")
-    for lower, upper in zip(roles, roles[1:], strict=False):
+    for lower, upper in itertools.pairwise(roles):
         if f"{side}_{upper}" in parts:
             continue
         index = int(skeleton.parents[parts[f"{side}_{lower}"]])
         while index > 0 and _HELPER.search(skeleton.names[index]):
             index = int(skeleton.parents[index])
         if index <= 0:
-            raise InputError(skeleton.name or "skeleton", f"mapping.{side}_{upper}", f"the {side} limb has too few joints")
+            raise InputError(
+                skeleton.name or "skeleton", f"mapping.{side}_{upper}", f"the {side} limb has too few joints"
+            )
         parts[f"{side}_{upper}"] = index
 
 

@@ -1,22 +1,31 @@
 """A motion of any humanoid skeleton onto the model's, with a report of the error it makes.
 
-1. The source's *calibration pose* (its zero pose or its first frame, whichever stands more like a person) fixes how each
-   source joint's frame lies against the model's: by the smallest rotation that brings the bones together.
+1. :mod:`egopose.motion.calibration` finds how each source joint's frame lies in the model's.
 2. Joint orientations carry over; hinges are read off them.
-3. Inverse kinematics on the joint positions, bone by bone scaled to the model's lengths, takes out what the model's fewer
-   degrees of freedom (one at knee and elbow) leave over.
+3. Inverse kinematics on the joint positions, bone by bone scaled to the model's lengths, takes out what the model's
+   fewer degrees of freedom (one at knee and elbow) leave over.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from egopose.errors import InputError
 from egopose.motion import rotations as rot
-from egopose.motion.inverse_kinematics import Targets, solve
+from egopose.motion.calibration import (
+    align,
+    angle_between,
+    bend_axis,
+    bone_direction,
+    floor_normal,
+    mean_rotation,
+    part_positions,
+    upright_frames,
+)
+from egopose.motion.inverse_kinematics import Targets, solve_in_time
 from egopose.motion.kinematics import forward_kinematics
 from egopose.motion.mapping import SIDES, BodyMap, identify
 from egopose.motion.motion import Motion
@@ -37,9 +46,14 @@ MODEL_PARTS = {"hips": "Hips", "neck": "Neck", "head": "Head"} | {
         "foot": "Foot",
     }.items()
 }
+_UP = np.array([0.0, 0.0, 1.0])
+#: How far the angle between a foot's bone and the floor's normal may be from the model's, rad (20 degrees).
+_FLAT_FOOT = np.deg2rad(20.0)
+#: Mean sine of a limb's bend below which its bend axis is not known.
+_BEND_EVIDENCE = 0.05
 MODEL_SPINE = ("Spine", "Spine1", "Spine2", "Spine3")
 #: Links along which positions are scaled: part -> the part it is measured from.
-_LINKS = {"neck": "hips", "head": "neck"} | {
+_LINKS = {"neck": "hips", "head": "neck", "crown": "neck"} | {
     f"{side}_{part}": above if above in ("hips", "neck") else f"{side}_{above}"
     for side in SIDES
     for part, above in {
@@ -50,19 +64,6 @@ _LINKS = {"neck": "hips", "head": "neck"} | {
         "arm": "neck",
         "forearm": "arm",
         "hand": "forearm",
-    }.items()
-}
-#: The bone whose direction calibrates a part's frame: part -> the part at its far end.
-_BONES = {"hips": "neck", "neck": "head"} | {
-    f"{side}_{part}": f"{side}_{end}"
-    for side in SIDES
-    for part, end in {
-        "clavicle": "arm",
-        "arm": "forearm",
-        "forearm": "hand",
-        "thigh": "shin",
-        "shin": "foot",
-        "foot": "toe",
     }.items()
 }
 
@@ -92,7 +93,9 @@ class RetargetReport:
         """The report as text, worst joints first."""
         lines = [f"scale {self.scale:.3f}; ground shift {self.ground_shift_m[0] * 100:.1f} cm"]
         lines.append(f"{'part':<16}{'mean mm':>9}{'max mm':>9}{'mean deg':>10}{'max deg':>9}")
-        for part in sorted(set(self.position_mm) | set(self.orientation_deg), key=lambda p: -self.position_mm.get(p, (0, 0))[0]):
+        for part in sorted(
+            set(self.position_mm) | set(self.orientation_deg), key=lambda p: -self.position_mm.get(p, (0, 0))[0]
+        ):
             mm, deg = self.position_mm.get(part, (np.nan, np.nan)), self.orientation_deg.get(part, (np.nan, np.nan))
             lines.append(f"{part:<16}{mm[0]:>9.1f}{mm[1]:>9.1f}{deg[0]:>10.1f}{deg[1]:>9.1f}")
         if self.at_limit:
@@ -121,127 +124,111 @@ def retarget(
     """
     body_map = identify(motion.skeleton, overrides)
     positions, quats = motion.forward_kinematics()
-    calibration_positions, calibration_quats = _calibration(motion, body_map, positions, quats)
-    model_rest = _model_positions(model, model.rest_qpos()[None])[0]
-
-    points = _part_positions(body_map, positions, quats, motion.skeleton)
-    calibration = _part_positions(body_map, calibration_positions[None], calibration_quats[None], motion.skeleton)
-    calibration = {part: p[0] for part, p in calibration.items()}
-    facing = _facing(calibration)
-
-    orientations = _orientations(body_map, model, quats, calibration_quats, calibration, model_rest, facing)
+    points = part_positions(body_map, positions, quats, motion.skeleton)
+    model_rest = {part: p[0] for part, p in _model_points(model, model.rest_qpos()[None]).items()}
+    orientations = _orientations(motion, body_map, model, model_rest, quats, points)
     start = _read_hinges(model, orientations, limits)
-    scaled, scale = _scale(points, calibration, model_rest)
+    scaled, scale = _scale(points, model_rest)
     start[:, :3] = scaled["hips"]
     targets = _targets(model, scaled, orientations)
-    qpos = solve(model, start, targets, limits)
+    qpos = solve_in_time(model, start, targets, limits)
     qpos[:, 3:7] = rot.continuous(qpos[:, 3:7])
     out = Motion(model, qpos, motion.fps, motion.name, meta=dict(motion.meta))
     return out, _report(model, qpos, scaled, orientations, limits, body_map, scale)
 
 
-def _part_positions(body_map: BodyMap, positions: Array, quats: Array, skeleton: Skeleton) -> dict[str, Array]:
-    """World positions ``[T, 3]`` of every part. A missing toe is the foot's tip; a missing neck the chest joint."""
-    points = {part: positions[:, i] for part, i in body_map.parts.items()}
-    points.setdefault("neck", positions[:, body_map.parts["head"]])
-    for side in SIDES:
-        if f"{side}_toe" not in points:
-            foot = body_map.parts[f"{side}_foot"]
-            tips = skeleton.joints[foot].tips
-            if tips and np.linalg.norm(tips[0]) > 0.02:
-                points[f"{side}_toe"] = positions[:, foot] + rot.rotate(quats[:, foot], np.array(tips[0])[None])
-    if np.linalg.norm(points["neck"] - points["head"], axis=-1).max() < 1e-6:
-        tips = skeleton.joints[body_map.parts["head"]].tips
-        if tips and np.linalg.norm(tips[0]) > 0.02:
-            head = body_map.parts["head"]
-            points["head"] = positions[:, head] + rot.rotate(quats[:, head], np.array(tips[0])[None])
-        else:
-            del points["head"]
-    return points
-
-
-def _uprightness(points: dict[str, Array]) -> Array:
-    """``[T]``: how much a pose looks like standing straight: legs and trunk along z, left and right level. At most 1."""
-    def along(lower: str, upper: str) -> Array:
-        bone = points[upper] - points[lower]
-        return bone[:, 2] / np.maximum(np.linalg.norm(bone, axis=1), 1e-9)
-
-    legs = [along(f"{s}_foot", f"{s}_shin") + along(f"{s}_shin", f"{s}_thigh") for s in SIDES]
-    return (sum(legs) + 2 * along("hips", "neck")) / 6.0
-
-
-def _calibration(motion: Motion, body_map: BodyMap, positions: Array, quats: Array) -> tuple[Array, Array]:
-    """Positions ``[J, 3]`` and quaternions ``[J, 4]`` of the pose that tells how frames lie.
-
-    The zero pose if it stands upright (most rigs), else the first frame (a T-pose in many exports), else the most upright
-    frame there is.
-    """
-    zero = np.tile(motion.skeleton.rest_qpos(), (len(_AXIS_TURNS), 1))
-    zero[:, 3:7] = _AXIS_TURNS
-    zero_positions, zero_quats = forward_kinematics(motion.skeleton, zero)
-    stands = _uprightness(_part_positions(body_map, zero_positions, zero_quats, motion.skeleton))
-    best = int(np.argmax(stands))
-    if stands[best] > 0.97:
-        return zero_positions[best], zero_quats[best]
-    upright = _uprightness(_part_positions(body_map, positions, quats, motion.skeleton))
-    frame = 0 if upright[0] > 0.97 else int(np.argmax(upright))
-    return positions[frame], quats[frame]
-
-
-#: The turns that bring +z, -z, +y, -y, +x, -x of a file's zero pose to +z.
-_AXIS_TURNS = np.stack([rot.between(np.array(a, dtype=float), np.array([0.0, 0.0, 1.0])) for a in
-                        ((0, 0, 1), (0, 0, -1), (0, 1, 0), (0, -1, 0), (1, 0, 0), (-1, 0, 0))])  # fmt: skip
-
-
-def _facing(points: dict[str, Array]) -> Array:
-    """Heading quaternion ``[4]`` of a standing pose: x forward, at right angles to hips and shoulders."""
-    left = sum(points[f"left_{p}"] - points[f"right_{p}"] for p in ("thigh", "arm"))
-    forward = np.cross(left, np.array([0.0, 0.0, 1.0]))
-    angle = np.arctan2(forward[1], forward[0])
-    return np.array([np.cos(angle / 2), 0.0, 0.0, np.sin(angle / 2)])
-
-
 def _orientations(
+    motion: Motion,
     body_map: BodyMap,
     model: Skeleton,
-    quats: Array,
-    calibration_quats: Array,
-    calibration: dict[str, Array],
     model_rest: dict[str, Array],
-    facing: Array,
+    quats: Array,
+    points: dict[str, Array],
 ) -> dict[str, Array]:
     """World quaternions ``[T, 4]`` for the model's joints, carried over from the source's."""
-    def carried(source: int, aligned: Array) -> Array:
-        moved = rot.multiply(quats[:, source], rot.conjugate(calibration_quats[source])[None])
-        return rot.multiply(moved, rot.multiply(aligned, facing)[None])
+    parts, out = body_map.parts, {}
+    neutral = upright_frames(motion, body_map, quats, points)
 
-    def alignment(part: str) -> Array:
-        """The smallest turn (in the source's world) that lays the model's bone along the source's."""
-        end = _BONES.get(part)
-        if part == "hips" or end not in calibration or end not in model_rest:
-            return np.array([1.0, 0.0, 0.0, 0.0])
-        at = part if part in model_rest else "neck"
-        model_bone = rot.rotate(facing, model_rest[end] - model_rest[at])
-        return rot.between(model_bone, calibration[end] - calibration[part])
+    def carried(joint: int, constant: Array | None = None) -> Array:
+        return rot.multiply(quats[:, joint], (rot.conjugate(neutral[joint]) if constant is None else constant)[None])
 
-    out = {MODEL_PARTS[part]: carried(index, alignment(part)) for part, index in body_map.parts.items() if part in MODEL_PARTS}
-    # The source's n spine joints, first to first and last to last; those between are spread by slerp.
-    n = len(body_map.spine)
-    known = {3 if n == 1 else round(k * 3 / (n - 1)): i for k, i in enumerate(body_map.spine)}
-    aligned = np.array([1.0, 0.0, 0.0, 0.0])
-    chain = {-1: out["Hips"]} | {k: carried(i, aligned) for k, i in known.items()}
-    for k, name in enumerate(MODEL_SPINE):
-        below, above = max(j for j in chain if j <= k), min(j for j in chain if j >= k)
-        if below != above:
-            part = rot.to_rotvec(rot.multiply(rot.conjugate(chain[below]), chain[above]))
-            out[name] = rot.multiply(chain[below], rot.from_rotvec(part * (k - below) / (above - below)))
-        else:
-            out[name] = chain[k]
+    for part in ("hips", "neck", "head", "left_clavicle", "right_clavicle"):
+        if part in parts:
+            out[MODEL_PARTS[part]] = carried(parts[part])
+    for side in SIDES:
+        for chain in (("thigh", "shin", "foot"), ("arm", "forearm", "hand")):
+            out.update(
+                _limb_orientations(model, model_rest, body_map, quats, points, [f"{side}_{p}" for p in chain], carried)
+            )
+        foot, toe = f"{side}_foot", f"{side}_toe"
+        constant = None
+        if toe in points:
+            direction = bone_direction(quats[:, parts[foot]], points[toe] - points[foot])
+            normal = floor_normal(quats[:, parts[foot]], points[foot], points[toe], motion.fps)
+            model_toe = model_rest[toe] - model_rest[foot]
+            if abs(angle_between(normal, direction) - angle_between(_UP, model_toe)) < _FLAT_FOOT:
+                constant = align((normal, direction), (_UP, model_toe))
+            else:
+                # A dancer on the tips of the toes never shows the floor's normal: then the ankle's mean turn against
+                # the knee's axis is taken for none.
+                knee = np.array(model.joints[model.index(MODEL_PARTS[f"{side}_shin"])].dofs[0].axis)
+                across = bone_direction(quats[:, parts[foot]], rot.rotate(out[MODEL_PARTS[f"{side}_shin"]], knee[None]))
+                constant = align((direction, across), (model_toe, knee))
+        out[MODEL_PARTS[foot]] = carried(parts[foot], constant)
+        # A hand's neutral is its mean against the forearm; nothing measures the palm's side in most rigs.
+        forearm, hand = out[MODEL_PARTS[f"{side}_forearm"]], quats[:, parts[f"{side}_hand"]]
+        out[MODEL_PARTS[f"{side}_hand"]] = rot.multiply(
+            hand, rot.conjugate(mean_rotation(rot.multiply(rot.conjugate(forearm), hand)))[None]
+        )
+    _spread_spine(out, {k: carried(j) for k, j in _spine_slots(body_map).items()})
     out.setdefault("Neck", out["Spine3"])
     out.setdefault("Head", out["Neck"])
     for side in ("Right", "Left"):
         out.setdefault(f"{side}Shoulder", out["Spine3"])
     return out
+
+
+def _limb_orientations(
+    model: Skeleton,
+    model_rest: dict[str, Array],
+    body_map: BodyMap,
+    quats: Array,
+    points: dict[str, Array],
+    chain: list[str],
+    carried: Callable[..., Array],
+) -> dict[str, Array]:
+    """Orientations of a limb's two long bones from bone direction and bend axis; the neutral pose if it never bends."""
+    upper, lower, end = chain
+    bones = {upper: points[lower] - points[upper], lower: points[end] - points[lower]}
+    rest = {upper: model_rest[lower] - model_rest[upper], lower: model_rest[end] - model_rest[lower]}
+    hinge = np.array(model.joints[model.index(MODEL_PARTS[lower])].dofs[0].axis)
+    out = {}
+    for part in (upper, lower):
+        frame = quats[:, body_map.parts[part]]
+        axis, evidence = bend_axis(frame, bones[upper], bones[lower])
+        constant = None
+        if evidence > _BEND_EVIDENCE:
+            constant = align((bone_direction(frame, bones[part]), axis), (rest[part], hinge))
+        out[MODEL_PARTS[part]] = carried(body_map.parts[part], constant)
+    return out
+
+
+def _spine_slots(body_map: BodyMap) -> dict[int, int]:
+    """Model spine joint 0..3 -> source joint: first to first, last to last (a single one to the last)."""
+    n = len(body_map.spine)
+    return {3 if n == 1 else round(k * 3 / (n - 1)): joint for k, joint in enumerate(body_map.spine)}
+
+
+def _spread_spine(out: dict[str, Array], known: dict[int, Array]) -> None:
+    """Fill the model's spine joints that have no source by slerp between their neighbours."""
+    chain = {-1: out["Hips"]} | known
+    for k, name in enumerate(MODEL_SPINE):
+        below, above = max(j for j in chain if j <= k), min(j for j in chain if j >= k)
+        if below == above:
+            out[name] = chain[k]
+            continue
+        part = rot.to_rotvec(rot.multiply(rot.conjugate(chain[below]), chain[above]))
+        out[name] = rot.multiply(chain[below], rot.from_rotvec(part * (k - below) / (above - below)))
 
 
 def _read_hinges(model: Skeleton, orientations: dict[str, Array], limits: Array) -> Array:
@@ -261,11 +248,7 @@ def _read_hinges(model: Skeleton, orientations: dict[str, Array], limits: Array)
         else:
             angles = Rotation.as_davenport(rot.to_scipy(local), axes, "intrinsic")
         low, high = limits[model.dof_slices[j], 0], limits[model.dof_slices[j], 1]
-        centre = (low + high) / 2
-        angles = np.unwrap(angles, axis=0)
-        # The branch nearest the middle of the range, decided once a clip so that time stays smooth.
-        angles = angles - 2 * np.pi * np.round((np.median(angles, axis=0) - centre) / (2 * np.pi))
-        qpos[:, columns] = np.clip(angles, low, high)
+        qpos[:, columns] = np.clip(_within(angles, axes, low, high), low, high)
         reached = np.broadcast_to(np.array([1.0, 0, 0, 0]), (frames, 4))
         for k, axis in enumerate(axes):
             reached = rot.multiply(reached, rot.from_axis_angle(axis, qpos[:, columns.start + k]))
@@ -273,52 +256,66 @@ def _read_hinges(model: Skeleton, orientations: dict[str, Array], limits: Array)
     return qpos
 
 
-def _model_positions(model: Skeleton, qpos: Array) -> list[dict[str, Array]]:
-    """For each frame, the model's position of every part that has one (toe: the foot's tip)."""
+def _within(angles: Array, axes: Array, low: Array, high: Array) -> Array:
+    """The equal set of angles ``[T, d]`` about ``axes [d, 3]`` that fits the limits best.
+
+    Three hinges reach every orientation twice, (a, b, c) and (a + pi, 2 lock - b, c + pi), where ``lock`` is the middle
+    angle that lays the third axis along the first; and each angle may be moved by a whole turn.
+    """
+    centre = (low + high) / 2
+    ways = [angles]
+    if len(axes) == 3:
+        lock = np.arctan2(np.dot(np.cross(axes[2], axes[0]), axes[1]), np.dot(axes[2], axes[0]))
+        ways.append(angles * [1, -1, 1] + [np.pi, 2 * lock, np.pi])
+    ways = [w - 2 * np.pi * np.round((w - centre) / (2 * np.pi)) for w in ways]
+    # Outside the limits costs most; inside, the nearer the middle the better, which keeps time smooth.
+    cost = [np.sum((w - np.clip(w, low, high)) ** 2 + 0.01 * (w - centre) ** 2, axis=1) for w in ways]
+    return np.take_along_axis(np.stack(ways), np.argmin(cost, axis=0)[None, :, None], axis=0)[0]
+
+
+def _model_points(model: Skeleton, qpos: Array) -> dict[str, Array]:
+    """The model's position ``[T, 3]`` of every part (toe and crown: tips)."""
     positions, quats = forward_kinematics(model, qpos)
-    frames = []
-    for t in range(len(qpos)):
-        points = {part: positions[t, model.index(name)] for part, name in MODEL_PARTS.items()}
-        for side in SIDES:
-            foot = model.index(f"{side.capitalize()}Foot")
-            tip = np.array(model.joints[foot].tips[0])
-            points[f"{side}_toe"] = positions[t, foot] + rot.rotate(quats[t, foot], tip)
-        frames.append(points)
-    return frames
+    points = {part: positions[:, model.index(name)] for part, name in MODEL_PARTS.items()}
+    for part, (joint, tip) in _tips(model).items():
+        points[part] = positions[:, joint] + rot.rotate(quats[:, joint], tip[None])
+    return points
 
 
-def _scale(
-    points: dict[str, Array], calibration: dict[str, Array], model_rest: dict[str, Array]
-) -> tuple[dict[str, Array], float]:
+def _tips(model: Skeleton) -> dict[str, tuple[int, Array]]:
+    joints = {f"{side}_toe": model.index(f"{side.capitalize()}Foot") for side in SIDES} | {"crown": model.index("Head")}
+    return {part: (j, np.array(model.joints[j].tips[0])) for part, j in joints.items()}
+
+
+def _scale(points: dict[str, Array], model_rest: dict[str, Array]) -> tuple[dict[str, Array], float]:
     """Source positions with every link stretched to the model's length; the root by the ratio of the legs."""
-    def leg(p: dict[str, Array]) -> float:
-        return float(
-            sum(np.linalg.norm(p[f"{s}_{a}"] - p[f"{s}_{b}"]) for s in SIDES for a, b in (("thigh", "shin"), ("shin", "foot")))
-        )
 
-    scale = leg(model_rest) / leg(calibration)
+    def length(part: str, above: str) -> float:
+        return float(np.median(np.linalg.norm(points[part] - points[above], axis=1)))
+
+    legs = [(f"{s}_{a}", f"{s}_{b}") for s in SIDES for a, b in (("shin", "thigh"), ("foot", "shin"))]
+    scale = sum(float(np.linalg.norm(model_rest[a] - model_rest[b])) for a, b in legs) / sum(
+        length(a, b) for a, b in legs
+    )
     scaled = {"hips": points["hips"] * scale}
     for part, above in _LINKS.items():
-        if part not in points or above not in points:
+        if part not in points or above not in scaled or length(part, above) < 0.02:
             continue
-        length = np.linalg.norm(calibration[part] - calibration[above])
-        if length < 0.02:
-            continue
-        ratio = np.linalg.norm(model_rest[part] - model_rest[above]) / length
+        ratio = np.linalg.norm(model_rest[part] - model_rest[above]) / length(part, above)
         scaled[part] = scaled[above] + (points[part] - points[above]) * ratio
     return scaled, scale
 
 
 def _targets(model: Skeleton, scaled: dict[str, Array], orientations: dict[str, Array]) -> Targets:
+    tips = _tips(model)
     joint, offset, position, weight = [], [], [], []
     for part, target in scaled.items():
-        name = f"{part.split('_')[0].capitalize()}Foot" if part.endswith("_toe") else MODEL_PARTS[part]
-        index = model.index(name)
+        index, tip = tips.get(part) or (model.index(MODEL_PARTS[part]), np.zeros(3))
         joint.append(index)
-        offset.append(model.joints[index].tips[0] if part.endswith("_toe") else (0.0, 0.0, 0.0))
+        offset.append(tip)
         position.append(target)
         # The trunk is only as stiff as its joints allow; limbs and above all feet must arrive.
-        weight.append({"foot": 2.0, "toe": 1.5, "neck": 0.5, "head": 0.5, "arm": 0.5}.get(part.split("_")[-1], 1.0))
+        weight.append({"foot": 2.0, "toe": 1.0, "neck": 0.5, "head": 0.5, "arm": 0.5}.get(part.split("_")[-1], 1.0))
     # Metres a radian: orientation decides only what positions leave open.
     frame_weight = {"Hips": 0.2, "Head": 0.1, "RightHand": 0.05, "LeftHand": 0.05, "RightFoot": 0.05, "LeftFoot": 0.05}
     spine = dict.fromkeys((*MODEL_SPINE, "Neck", "RightShoulder", "LeftShoulder", "RightArm", "LeftArm"), 0.02)
@@ -345,15 +342,11 @@ def _report(
     body_map: BodyMap,
     scale: float,
 ) -> RetargetReport:
-    positions, quats = forward_kinematics(model, qpos)
+    _, quats = forward_kinematics(model, qpos)
+    reached = _model_points(model, qpos)
     mm, degrees = {}, {}
     for part, target in scaled.items():
-        if part.endswith("_toe"):
-            foot = model.index(f"{part.split('_')[0].capitalize()}Foot")
-            point = positions[:, foot] + rot.rotate(quats[:, foot], np.array(model.joints[foot].tips[0])[None])
-        else:
-            point = positions[:, model.index(MODEL_PARTS[part])]
-        distance = 1000 * np.linalg.norm(point - target, axis=1)
+        distance = 1000 * np.linalg.norm(reached[part] - target, axis=1)
         mm[part] = (float(distance.mean()), float(distance.max()))
     for part, name in MODEL_PARTS.items():
         if part in body_map.parts:
@@ -365,11 +358,3 @@ def _report(
     names = [f"{j.name}_{k}" for j in model.joints for k in range(len(j.dofs))]
     at_limit = {n: float(s) for n, s in zip(names, stuck, strict=True) if s > 0}
     return RetargetReport(mm, degrees, at_limit, body_map.unmapped, scale)
-
-
-def require_humanoid(motion: Motion) -> BodyMap:
-    """The body map, or one clear error. Raises InputError."""
-    try:
-        return identify(motion.skeleton)
-    except InputError as error:
-        raise InputError(motion.name or "motion", error.field, error.cause) from None

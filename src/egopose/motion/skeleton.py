@@ -64,7 +64,7 @@ class Skeleton:
             raise ValueError(f"joint names stand twice: {', '.join(twice)}")
         for i, joint in enumerate(self.joints):
             if (joint.parent == -1) != (i == 0) or joint.parent >= i:
-                raise ValueError(f"joint {joint.name!r}: parent {joint.parent} must come before it; only the first is root")
+                raise ValueError(f"joint {joint.name!r}: its parent {joint.parent} must stand before it")
         if self.joints[0].dofs:
             raise ValueError("the root is free; it takes no further degrees of freedom")
 

@@ -19,8 +19,8 @@ from egopose.motion.motion import Motion
 from egopose.motion.rotations import Array
 from egopose.motion.skeleton import Joint, Skeleton, hinges
 
-# name, parent, offset in the T-pose (x left, y up, z forward; m), hinge order. The middle hinge is the twist, which stays
-# furthest from a quarter turn: about y for what stands or hangs along it, about x for arms.
+# name, parent, offset in the T-pose (x left, y up, z forward; m), hinge order. The middle hinge is the twist, which
+# stays furthest from a quarter turn: about y for what stands or hangs along it, about x for arms.
 _BODY = (
     ("pelvis", "", (0.0, -0.22, 0.03), ""),
     ("left_hip", "pelvis", (0.07, -0.09, -0.01), "zyx"),

@@ -21,8 +21,8 @@ def write_bvh(motion: Motion, path: str | Path, *, unit: str = "cm", up: str = "
     """Write a BVH file.
 
     Whatever its degrees of freedom, a joint's local rotation becomes Z, Y, X angles in degrees. Joints are written
-    depth first, as the format wants; blanks and braces in names become ``_``; a leaf without tips gets an End Site of no
-    length.
+    depth first, as the format wants; blanks and braces in names become ``_``; a leaf without tips gets an End Site of
+    no length.
 
     Args:
         motion: z up, metres.

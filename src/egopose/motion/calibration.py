@@ -1,0 +1,149 @@
+"""How a source joint's frame lies in the model's: one constant rotation a part, found from the motion itself.
+
+Rigs disagree about their zero pose (some fold every bone onto one axis), so no pose is trusted further than it must be:
+
+* limbs: the bone's direction and the axis the elbow or knee bends about, both constant in the bone's own frame;
+* feet: the direction to the toes and the floor's normal while the foot stands flat;
+* trunk, neck, head: the zero pose if it stands upright, else the mean of the clip's most upright frames.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from egopose.motion import rotations as rot
+from egopose.motion.kinematics import forward_kinematics
+from egopose.motion.mapping import SIDES, BodyMap
+from egopose.motion.motion import Motion
+from egopose.motion.rotations import Array
+from egopose.motion.skeleton import Skeleton
+
+#: The turns that bring +z, -z, +y, -y, +x, -x of a file's zero pose to +z.
+_AXIS_TURNS = np.stack(
+    [
+        rot.between(np.array(a, dtype=float), np.array([0.0, 0.0, 1.0]))
+        for a in ((0, 0, 1), (0, 0, -1), (0, 1, 0), (0, -1, 0), (1, 0, 0), (-1, 0, 0))
+    ]
+)
+_UPRIGHT = 0.97  # of 1: legs and trunk within some 14 degrees of the vertical
+_UP = np.array([0.0, 0.0, 1.0])
+
+
+def part_positions(body_map: BodyMap, positions: Array, quats: Array, skeleton: Skeleton) -> dict[str, Array]:
+    """World positions ``[T, 3]`` of every part; a missing toe is the foot's tip, a missing neck the head's joint."""
+    points = {part: positions[:, i] for part, i in body_map.parts.items()}
+
+    def tip(joint: int) -> Array | None:
+        tips = skeleton.joints[joint].tips
+        if not tips or np.linalg.norm(tips[0]) < 0.02:
+            return None
+        return positions[:, joint] + rot.rotate(quats[:, joint], np.array(tips[0])[None])
+
+    if "neck" not in points:
+        # The head's joint is where the neck begins; the head is then its tip, if there is one.
+        points["neck"] = points.pop("head")
+        if (crown := tip(body_map.parts["head"])) is not None:
+            points["crown"] = crown
+    for side in SIDES:
+        if f"{side}_toe" not in points and (toe := tip(body_map.parts[f"{side}_foot"])) is not None:
+            points[f"{side}_toe"] = toe
+    return points
+
+
+def facing(points: dict[str, Array]) -> Array:
+    """Heading quaternions ``[T, 4]``: x at right angles to hips and shoulders, forward."""
+    left = sum(points[f"left_{p}"] - points[f"right_{p}"] for p in ("thigh", "arm"))
+    forward = np.cross(left, _UP)
+    angle = np.arctan2(forward[..., 1], forward[..., 0])
+    return rot.from_axis_angle(_UP, angle)
+
+
+def uprightness(points: dict[str, Array]) -> Array:
+    """``[T]``, at most 1: how nearly legs and trunk stand along z."""
+
+    def along(lower: str, upper: str) -> Array:
+        bone = points[upper] - points[lower]
+        return bone[:, 2] / np.maximum(np.linalg.norm(bone, axis=1), 1e-9)
+
+    legs = [along(f"{s}_foot", f"{s}_shin") + along(f"{s}_shin", f"{s}_thigh") for s in SIDES]
+    return (sum(legs) + 2 * along("hips", "neck")) / 6.0
+
+
+def mean_rotation(quats: Array) -> Array:
+    """Chordal mean ``[4]`` of ``[T, 4]``."""
+    return rot.from_scipy(rot.to_scipy(quats).mean(), (1,))[0]
+
+
+def upright_frames(motion: Motion, body_map: BodyMap, quats: Array, points: dict[str, Array]) -> Array:
+    """Each source joint's orientation ``[J, 4]`` in the heading frame of an upright, forward-looking stance."""
+    zero = np.tile(motion.skeleton.rest_qpos(), (len(_AXIS_TURNS), 1))
+    zero[:, 3:7] = _AXIS_TURNS
+    zero_positions, zero_quats = forward_kinematics(motion.skeleton, zero)
+    zero_points = part_positions(body_map, zero_positions, zero_quats, motion.skeleton)
+    stands = uprightness(zero_points)
+    best = int(np.argmax(stands))
+    if stands[best] > _UPRIGHT:
+        return rot.multiply(rot.conjugate(facing(zero_points)[best])[None], zero_quats[best])
+    upright = uprightness(points)
+    frames = upright >= min(np.quantile(upright, 0.8), _UPRIGHT)
+    relative = rot.multiply(rot.conjugate(facing(points))[:, None], quats)[frames]
+    return np.stack([mean_rotation(relative[:, j]) for j in range(relative.shape[1])])
+
+
+def frame_from(first: Array, second: Array) -> Rotation:
+    """The frame whose x lies along ``first`` and whose y lies nearest ``second`` (vectors ``[3]``)."""
+    x = first / np.linalg.norm(first)
+    y = second - np.dot(second, x) * x
+    y = y / np.linalg.norm(y)
+    return Rotation.from_matrix(np.stack([x, y, np.cross(x, y)], axis=1))
+
+
+def align(source: tuple[Array, Array], model: tuple[Array, Array]) -> Array:
+    """The constant quaternion ``[4]`` c with ``model orientation = source orientation * c``.
+
+    Both pairs are (first, second) directions in their own frames; the first are brought together exactly.
+    """
+    return rot.from_scipy(frame_from(*source) * frame_from(*model).inv(), (1,))[0]
+
+
+def angle_between(a: Array, b: Array) -> float:
+    """Angle of two vectors ``[3]``, rad."""
+    return float(np.arccos(np.clip(np.dot(a, b) / (np.linalg.norm(a) * np.linalg.norm(b)), -1.0, 1.0)))
+
+
+def bone_direction(quats: Array, bone: Array) -> Array:
+    """Mean direction ``[3]`` of a bone, world vectors ``[T, 3]``, in its own frame ``[T, 4]``."""
+    local = rot.rotate(rot.conjugate(quats), bone)
+    return local.mean(axis=0)
+
+
+def bend_axis(quats: Array, upper: Array, lower: Array) -> tuple[Array, float]:
+    """The axis a limb bends about, in the frame ``quats [T, 4]``, and the evidence for it.
+
+    Args:
+        quats: orientation of one of the limb's two bones.
+        upper, lower: ``[T, 3]`` world vectors of the two bones.
+
+    Returns:
+        Unit axis ``[3]`` (the turn that takes ``upper`` to ``lower``) and the mean sine of the bend.
+    """
+    normal = np.cross(upper, lower) / (np.linalg.norm(upper, axis=1) * np.linalg.norm(lower, axis=1) + 1e-12).reshape(
+        -1, 1
+    )
+    local = rot.rotate(rot.conjugate(quats), normal)
+    mean = local.mean(axis=0)
+    evidence = float(np.linalg.norm(mean))
+    return mean / max(evidence, 1e-12), evidence
+
+
+def floor_normal(quats: Array, ankle: Array, toe: Array, fps: float) -> Array:
+    """The floor's normal ``[3]`` in the foot's frame: the mean of up while the foot stands (low and slow)."""
+    speed = (
+        np.linalg.norm(np.gradient(toe, axis=0), axis=1) * fps
+        + np.linalg.norm(np.gradient(ankle, axis=0), axis=1) * fps
+    )
+    height = ankle[:, 2] + toe[:, 2]
+    score = (height - np.quantile(height, 0.02)) / 0.05 + speed / 0.5
+    flat = score <= np.quantile(score, 0.2)
+    return rot.rotate(rot.conjugate(quats[flat]), np.broadcast_to(_UP, (int(flat.sum()), 3))).mean(axis=0)
