@@ -108,7 +108,10 @@ class ImitationProblem:
         self.reference = reference
         # Plain tensors: indexing them costs a third of indexing the (memory-mapped) TensorDict each step.
         self._reference = {k: torch.as_tensor(reference[k]).to(torch.float64) for k in BODY_KEYS}
-        self.layout = BodyLayout(torch.as_tensor(humanoid.joint_parent), torch.as_tensor(humanoid.end_effectors))
+        self.layout = BodyLayout(
+            torch.as_tensor(humanoid.joint_parent, dtype=torch.int64),
+            torch.as_tensor(humanoid.end_effectors, dtype=torch.int64),
+        )
         self._range = torch.as_tensor(humanoid.joint_range, dtype=torch.float64).T
         self._rest = torch.as_tensor(humanoid.rest_action, dtype=torch.float64)
         self._table: Tensor | None = None

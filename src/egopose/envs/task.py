@@ -11,6 +11,7 @@ import mujoco
 import numpy as np
 import torch
 from dm_control import mujoco as dm_mujoco
+from dm_control.mujoco import wrapper
 from dm_control.rl import control
 from dm_env import specs
 from numpy.typing import NDArray
@@ -33,20 +34,20 @@ class HumanoidPhysics(dm_mujoco.Physics):
 
     def step(self, nstep: int = 1) -> None:
         data = self.data
-        before = (data.time, data.qpos.copy(), data.qvel.copy())
+        before, warnings = np.concatenate([data.qpos, data.qvel]), int(data.warning.number.sum())
         data.qacc_warmstart[:] = 0.0
-        with self.suppress_physics_errors():
-            super().step(nstep)
-        due = before[0] + nstep * self.model.opt.timestep
+        with self.suppress_physics_errors(), self.check_invalid_state():
+            # Not dm_control's mj_step2 first: after a reset that would take over what was computed with actuation off.
+            mujoco.mj_step(self.model.ptr, data.ptr, nstep)
+            mujoco.mj_step1(self.model.ptr, data.ptr)
         self.diverged = not (
-            np.isfinite(data.qpos).all()
+            int(data.warning.number.sum()) == warnings
+            and np.isfinite(data.qpos).all()
             and (np.abs(data.qvel) < self.max_speed).all()
-            and np.isfinite(data.ctrl).all()
-            and abs(data.time - due) < 0.5 * self.model.opt.timestep
         )
         if self.diverged:
-            data.time, data.qpos[:], data.qvel[:] = before[0], before[1], 0.0
-            data.ctrl[:] = 0.0
+            data.qpos[:] = before[: len(data.qpos)] if np.isfinite(before).all() else self.model.qpos0
+            data.qvel[:], data.ctrl[:] = 0.0, 0.0
             mujoco.mj_forward(self.model.ptr, data.ptr)
 
 
@@ -102,7 +103,7 @@ class EgoPoseTask(control.Task):
         return 1.0 if bool(self._frame >= self._stop - 1) else None
 
     def _body_state(self, physics: HumanoidPhysics) -> TensorDict:
-        # dm_control's step ends with mj_step1, so positions are those of the present qpos.
+        # The step ends with mj_step1, so positions are those of the present qpos.
         data, ids = physics.data, self.problem.humanoid.body_ids
         mass = physics.model.body_mass[ids]
         arrays = {
@@ -118,7 +119,7 @@ class EgoPoseTask(control.Task):
 def load_environment(problem: ImitationProblem, starts: Starts, seed: int = 0) -> dm_env.Environment:
     """One world as a dm_env, ready for ``dm_control.viewer.launch`` or TorchRL's ``DMControlWrapper``."""
     # A copy: dm_control switches actuation off and on in the model while it resets.
-    physics = HumanoidPhysics.from_model(copy.copy(problem.humanoid.mj_model))
+    physics = HumanoidPhysics.from_model(wrapper.MjModel(copy.copy(problem.humanoid.mj_model)))
     return control.Environment(
         physics, EgoPoseTask(problem, starts, seed), n_sub_steps=problem.humanoid.substeps, legacy_step=True
     )

@@ -66,9 +66,8 @@ class StateNormalizer(Transform):
     @property
     def std(self) -> Tensor:
         """``[D]`` sample deviation; ones before two observations were seen."""
-        if self.count < 2:
-            return torch.ones_like(self.mean)
-        return (self.sum_of_squares / (self.count - 1)).sqrt()
+        count = int(self.count)
+        return (self.sum_of_squares / (count - 1)).sqrt() if count > 1 else torch.ones_like(self.mean)
 
     def freeze(self, frozen: bool = True) -> StateNormalizer:
         """Stop (or take up again) the updates; normalising goes on."""
@@ -82,9 +81,11 @@ class StateNormalizer(Transform):
             return
         values = values.to(torch.float64)
         mean = values.mean(0)
-        total = self.count + n
+        # Python numbers: dividing integer tensors would round the weights to float32.
+        before = int(self.count)
+        total = before + n
         delta = mean - self.mean
-        self.sum_of_squares += (values - mean).square().sum(0) + delta.square() * (self.count * n / total)
+        self.sum_of_squares += (values - mean).square().sum(0) + delta.square() * (before * n / total)
         self.mean += delta * (n / total)
         self.count += n
 
