@@ -10,6 +10,7 @@ import torch
 from tensordict import TensorDict
 
 from egopose.envs.problem import TakeTable
+from egopose.motion import rotations as rot
 from egopose.motion.motion import finite_difference
 
 _JOINTS = {
@@ -101,7 +102,9 @@ def reference_motion(humanoid: StandIn, lengths: tuple[int, ...] = (40, 25)) -> 
         qpos[:, 0:2] = 0.1 * t
         qpos[:, 2] = 0.97 + 0.005 * np.sin(3 * t[:, 0])
         angle = 0.5 * (k + 0.3 * t[:, 0])
-        qpos[:, 3], qpos[:, 6] = np.cos(angle), np.sin(angle)
+        yaw = np.stack([np.cos(angle), 0 * angle, 0 * angle, np.sin(angle)], axis=-1)
+        lean = 0.05 * np.concatenate([np.sin(2 * t), np.cos(3 * t), 0 * t], axis=-1)
+        qpos[:, 3:7] = rot.multiply(yaw, rot.from_rotvec(lean))
         qpos[:, 7:] = 0.1 * np.sin(2 * t + k + np.arange(model.nq - 7))
         state = {"qpos": qpos, "qvel": finite_difference(qpos, 30.0)}
         bodies = {name: [] for name in ("xpos", "xquat", "com")}

@@ -1,0 +1,140 @@
+"""Visual context and the running normaliser against NumPy, in and out of an environment."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from env_stand_in import environment, problem
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+from tensordict import TensorDict
+from torchrl.envs import Compose, TransformedEnv
+from torchrl.envs.utils import check_env_specs
+
+from egopose.envs.transforms import StateNormalizer, VisualContext
+
+ROWS = arrays(np.float64, st.tuples(st.integers(1, 12), st.just(3)), elements=st.floats(-1e4, 1e4, width=32))
+
+
+@given(batches=st.lists(ROWS, min_size=1, max_size=8))
+@settings(max_examples=60, deadline=None)
+def test_statistics_are_numpys(batches: list[np.ndarray]) -> None:
+    normalizer = StateNormalizer(3)
+    for batch in batches:
+        normalizer.update(torch.from_numpy(batch))
+    rows = np.concatenate(batches)
+    assert normalizer.count.item() == len(rows)
+    np.testing.assert_allclose(normalizer.mean, rows.mean(0), rtol=1e-9, atol=1e-7)
+    expected = rows.std(0, ddof=1) if len(rows) > 1 else np.ones(3)
+    np.testing.assert_allclose(normalizer.std, expected, rtol=1e-6, atol=1e-6)
+
+
+def test_large_nearly_constant_features_stay_finite() -> None:
+    """Where E[x^2] - E[x]^2 in float32 is negative."""
+    normalizer = StateNormalizer(2)
+    generator = torch.Generator().manual_seed(0)
+    rows = 1e4 + 1e-3 * torch.randn(5000, 2, generator=generator, dtype=torch.float64)
+    rows[:, 1] = 123.456
+    for batch in rows.split(50):
+        normalizer.update(batch)
+    np.testing.assert_allclose(normalizer.std[0], rows[:, 0].std(), rtol=1e-6)
+    out = normalizer.normalize(rows.float())
+    assert torch.isfinite(out).all()
+    assert (out[:, 1].abs() <= 5).all()
+    assert normalizer.normalize(rows)[:, 1].abs().max() < 1e-3
+
+
+def test_values_are_clipped_and_keep_their_dtype() -> None:
+    normalizer = StateNormalizer(1, clip=5.0)
+    normalizer.update(torch.randn(100, 1))
+    out = normalizer.normalize(torch.tensor([[1e6], [-1e6]]))
+    assert out.dtype == torch.float32
+    assert out.squeeze().tolist() == [5.0, -5.0]
+
+
+def transformed(n: int = 4, **kwargs) -> tuple[TransformedEnv, StateNormalizer]:
+    env = environment(n, **kwargs)
+    normalizer = StateNormalizer(env.observation_spec["humanoid_state"].shape[-1])
+    table = torch.randn(env.problem.n_frames, 16, generator=torch.Generator().manual_seed(0))
+    return TransformedEnv(env, Compose(VisualContext(table), normalizer)), normalizer
+
+
+def zero_action(env):
+    return lambda td: td.set("action", torch.zeros(env.action_spec.shape))
+
+
+def test_the_transformed_environment_keeps_its_specs() -> None:
+    env, _ = transformed()
+    check_env_specs(env)
+    assert env.observation_spec["visual_context"].shape == (4, 16)
+
+
+def test_every_new_observation_counts_once() -> None:
+    env, normalizer = transformed(problem=problem(termination={"enabled": False, "head_drop": 0.1}))
+    raw = []
+    base = env.base_env
+    original = base.problem.observation
+
+    def spy(state):
+        raw.append(original(state))
+        return raw[-1]
+
+    base.problem.observation = spy
+    td = env.rollout(20, zero_action(env), break_when_any_done=False)
+    resets = int(td["next", "done"][:, :-1].sum())
+    resets += int(td["next", "done"][:, -1].sum()) * 0  # rollout does not reset after its last step
+    assert resets > 0
+    assert normalizer.count.item() == 4 + 4 * 20 + resets
+    # Whole-batch observations come from the first reset and the steps; the rows in between are the resets'.
+    assert torch.isfinite(td["humanoid_state"]).all()
+    assert td["humanoid_state"].abs().max() <= 5
+
+
+def test_worlds_that_go_on_keep_what_the_policy_saw() -> None:
+    """A reset of others must not renormalise the observation a world acts on next."""
+    env, _ = transformed(problem=problem(termination={"enabled": False, "head_drop": 0.1}))
+    td = env.rollout(20, zero_action(env), break_when_any_done=False)
+    going = ~td["next", "done"].squeeze(-1)[:, :-1]
+    assert (td["next", "humanoid_state"][:, :-1][going] == td["humanoid_state"][:, 1:][going]).all()
+
+
+def test_context_rows_follow_the_frame() -> None:
+    env, _ = transformed()
+    table = env.transform[0].table
+    td = env.rollout(20, zero_action(env), break_when_any_done=False)
+    assert (td["visual_context"] == table[td["frame"].squeeze(-1)]).all()
+    assert (td["next", "visual_context"] == table[td["next", "frame"].squeeze(-1)]).all()
+
+
+def test_context_can_stay_that_of_the_start() -> None:
+    env = environment(3)
+    table = torch.randn(env.problem.n_frames, 8)
+    fixed = TransformedEnv(env, VisualContext(table, frame_key="episode_start"))
+    td = fixed.rollout(12, zero_action(fixed), break_when_any_done=False)
+    assert (td["visual_context"] == table[td["episode_start"].squeeze(-1)]).all()
+
+
+def test_frozen_statistics_do_not_move() -> None:
+    env, normalizer = transformed()
+    env.rollout(5, zero_action(env))
+    before = {k: v.clone() for k, v in normalizer.state_dict().items()}
+    normalizer.freeze()
+    env.rollout(5, zero_action(env))
+    assert all((normalizer.state_dict()[k] == v).all() for k, v in before.items())
+
+
+def test_state_round_trip_to_the_bit() -> None:
+    env, normalizer = transformed()
+    env.rollout(7, zero_action(env))
+    other, restored = transformed()
+    other.load_state_dict(env.state_dict())
+    for name, value in normalizer.state_dict().items():
+        assert (restored.state_dict()[name] == value).all()
+        assert restored.state_dict()[name].dtype == value.dtype
+    values = torch.randn(5, len(normalizer.mean))
+    assert (normalizer.normalize(values) == restored.normalize(values)).all()
+    # Outside an environment it normalises and does not count.
+    count = restored.count.item()
+    restored(TensorDict({"humanoid_state": values}, batch_size=[5]))
+    assert restored.count.item() == count

@@ -1,0 +1,255 @@
+"""The equations against SciPy, hand formulas and their symmetries."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from humanoid_stand_in import StandIn, reference_motion, stand_in
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+from tensordict import TensorDict
+
+from egopose.envs.mdp import observations as obs
+from egopose.envs.mdp import rewards
+from egopose.envs.mdp import rotations as rot
+from egopose.envs.mdp.terminations import fallen
+
+SCALES = {
+    "pose": 2.0,
+    "end_effector": 20.0,
+    "root_pose": 300.0,
+    "root_linear_velocity": 1.0,
+    "root_angular_velocity": 0.1,
+}
+WEIGHTS = {"pose": 0.5, "end_effector": 0.3, "root_pose": 0.1, "root_velocity": 0.1}
+WORLD = {"pose": 2.0, "velocity": 0.1, "end_effector": 40.0, "centre_of_mass": 10.0}
+WORLD_WEIGHTS = {"pose": 0.65, "velocity": 0.1, "end_effector": 0.15, "centre_of_mass": 0.1}
+
+
+def scipy(q: torch.Tensor) -> Rotation:
+    return Rotation.from_quat(q.numpy()[..., [1, 2, 3, 0]])
+
+
+def random_quats(n: int, seed: int = 0) -> torch.Tensor:
+    q = torch.randn(n, 4, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
+    return q / q.norm(dim=-1, keepdim=True)
+
+
+@pytest.fixture(scope="module")
+def body() -> tuple[StandIn, TensorDict, rewards.BodyLayout]:
+    humanoid = stand_in()
+    reference, _ = reference_motion(humanoid)
+    layout = rewards.BodyLayout(torch.as_tensor(humanoid.joint_parent), torch.as_tensor(humanoid.end_effectors))
+    return humanoid, reference, layout
+
+
+def moved(state: TensorDict, yaw: float, shift: tuple[float, float]) -> TensorDict:
+    """The same bodies, turned about the vertical and carried along the floor."""
+    turn = torch.tensor([np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2)], dtype=torch.float64)
+    offset = torch.tensor([*shift, 0.0], dtype=torch.float64)
+    out = state.clone()
+    out["qpos"][:, :3] = rot.rotate(turn, state["qpos"][:, :3]) + offset
+    out["qpos"][:, 3:7] = rot.multiply(turn.expand(len(state), 4), state["qpos"][:, 3:7])
+    out["qvel"][:, :3] = rot.rotate(turn, state["qvel"][:, :3])
+    out["xpos"] = rot.rotate(turn, state["xpos"]) + offset
+    out["xquat"] = rot.multiply(turn.expand_as(state["xquat"]), state["xquat"])
+    out["com"] = rot.rotate(turn, state["com"]) + offset
+    return out
+
+
+def test_rotations_against_scipy() -> None:
+    p, q = random_quats(50), random_quats(50, 1)
+    v = torch.randn(50, 3, dtype=torch.float64)
+    both = scipy(rot.multiply(p, q))
+    assert (both * (scipy(p) * scipy(q)).inv()).magnitude() == pytest.approx(0, abs=1e-12)
+    np.testing.assert_allclose(rot.rotate(q, v).numpy(), scipy(q).apply(v.numpy()), atol=1e-12)
+    np.testing.assert_allclose(2 * rot.half_angle(q).numpy(), scipy(q).magnitude(), atol=1e-12)
+
+
+def test_heading_keeps_only_the_turn_about_the_vertical() -> None:
+    q = random_quats(50)
+    h = rot.heading(q)
+    assert (h[:, 1:3] == 0).all()
+    np.testing.assert_allclose(h.norm(dim=-1).numpy(), 1, atol=1e-12)
+    np.testing.assert_allclose(h[:, 3] * q[:, 0], h[:, 0] * q[:, 3], atol=1e-12)
+    # A half turn about a level axis has none: no division by zero.
+    assert torch.isfinite(rot.heading(torch.tensor([[0.0, 1.0, 0.0, 0.0]]))).all()
+
+
+def test_small_angles_keep_their_digits() -> None:
+    tiny = torch.tensor([[1.0, 1e-9, 0.0, 0.0]], dtype=torch.float64)
+    assert rewards.rotation_size(tiny, "half_angle").item() == pytest.approx(1e-9, rel=1e-6)
+    assert rewards.rotation_size(tiny, "angle").item() == pytest.approx(2e-9, rel=1e-6)
+
+
+@given(angle=st.floats(-7.0, 7.0))
+def test_rotation_size_is_the_short_way_round(angle: float) -> None:
+    q = torch.tensor([[np.cos(angle / 2), 0.0, np.sin(angle / 2), 0.0]], dtype=torch.float64)
+    short = abs((angle + np.pi) % (2 * np.pi) - np.pi)
+    for sign in (1, -1):
+        assert rewards.rotation_size(sign * q, "angle").item() == pytest.approx(short, abs=1e-9)
+        assert rewards.rotation_size(sign * q, "half_angle").item() == pytest.approx(short / 2, abs=1e-9)
+
+
+def test_humanoid_state_by_hand(body) -> None:
+    _, reference, _ = body
+    z = obs.humanoid_state(reference)
+    qpos, qvel = reference["qpos"].numpy(), reference["qvel"].numpy()
+    root = scipy(reference["qpos"][:, 3:7])
+    yaw = 2 * np.arctan2(qpos[:, 6], qpos[:, 3])
+    head = Rotation.from_euler("z", yaw[:, None])
+    nu = qpos.shape[1] - 7
+    assert z.shape == (len(qpos), 2 * qpos.shape[1] - 3)
+    np.testing.assert_allclose(z[:, 0], qpos[:, 2])
+    assert (scipy(z[:, 1:5]) * (head.inv() * root).inv()).magnitude() == pytest.approx(0, abs=1e-9)
+    np.testing.assert_allclose(z[:, 5 : 5 + nu], qpos[:, 7:])
+    np.testing.assert_allclose(z[:, 5 + nu : 8 + nu], head.inv().apply(qvel[:, :3]), atol=1e-12)
+    np.testing.assert_allclose(z[:, 8 + nu : 11 + nu], qvel[:, 3:6])
+    np.testing.assert_allclose(z[:, 11 + nu :], qvel[:, 6:])
+
+
+def test_joint_rotations_are_the_hinges(body) -> None:
+    """Hinges z, y, x in order are SciPy's intrinsic ZYX angles."""
+    _, reference, layout = body
+    local = obs.joint_rotations(reference, layout.parents)
+    spine = Rotation.from_euler("ZYX", reference["qpos"][:, 7:10].numpy())
+    assert (scipy(local[:, 0]) * spine.inv()).magnitude() == pytest.approx(0, abs=1e-9)
+
+
+def test_each_term_by_hand(body) -> None:
+    _, reference, layout = body
+    a, b = reference[:20], reference[20:40]
+
+    def relative(state: TensorDict, child: int) -> Rotation:
+        parent = int(layout.parents[child - 1])
+        return scipy(state["xquat"][:, parent]).inv() * scipy(state["xquat"][:, child])
+
+    def heading(state: TensorDict) -> Rotation:
+        q = state["qpos"].numpy()
+        return Rotation.from_euler("z", 2 * np.arctan2(q[:, 6:7], q[:, 3:4]))
+
+    angles = np.stack([(relative(a, j) * relative(b, j).inv()).magnitude() for j in range(1, a["xquat"].shape[1])], 1)
+    for metric, factor in (("half_angle", 0.5), ("angle", 1.0)):
+        expected = np.exp(-2 * ((factor * angles) ** 2).sum(1))
+        np.testing.assert_allclose(rewards.pose(a, b, layout.parents, 2.0, metric), expected, rtol=1e-9)
+
+    def ends(state: TensorDict) -> np.ndarray:
+        vectors = (state["xpos"][:, layout.end_effectors] - state["qpos"][:, None, :3]).numpy()
+        return np.stack([heading(state).inv().apply(vectors[:, e]) for e in range(vectors.shape[1])], 1)
+
+    expected = np.exp(-20 * ((ends(a) - ends(b)) ** 2).sum((1, 2)))
+    np.testing.assert_allclose(rewards.end_effector(a, b, layout.end_effectors, 20.0), expected, rtol=1e-9)
+
+    def tilt(state: TensorDict) -> Rotation:
+        return heading(state).inv() * scipy(state["qpos"][:, 3:7])
+
+    height = (a["qpos"][:, 2] - b["qpos"][:, 2]).numpy()
+    lean = 0.5 * (tilt(a) * tilt(b).inv()).magnitude()
+    expected = np.exp(-300 * (height**2 + lean**2))
+    np.testing.assert_allclose(rewards.root_pose(a, b, 300.0, "half_angle"), expected, rtol=1e-9)
+
+    def velocity(state: TensorDict, columns: slice, frame: Rotation) -> np.ndarray:
+        return frame.apply(state["qvel"][:, columns].numpy())
+
+    dl = velocity(a, slice(0, 3), heading(a).inv()) - velocity(b, slice(0, 3), heading(b).inv())
+    dw = velocity(a, slice(3, 6), tilt(a)) - velocity(b, slice(3, 6), tilt(b))
+    expected = np.exp(-(dl**2).sum(1) - 0.1 * (dw**2).sum(1))
+    np.testing.assert_allclose(rewards.root_velocity(a, b, 1.0, 0.1), expected, rtol=1e-9)
+
+
+def test_deepmimic_terms_by_hand(body) -> None:
+    _, reference, layout = body
+    a, b = reference[:20], reference[20:40]
+    dv = (a["qvel"] - b["qvel"])[:, 6:].numpy()
+    np.testing.assert_allclose(rewards.joint_velocity(a, b, 0.1), np.exp(-0.1 * (dv**2).sum(1)), rtol=1e-9)
+    dc = (a["com"] - b["com"]).numpy()
+    np.testing.assert_allclose(rewards.centre_of_mass(a, b, 10.0), np.exp(-10 * (dc**2).sum(1)), rtol=1e-9)
+    de = (a["xpos"] - b["xpos"])[:, layout.end_effectors].numpy()
+    expected = np.exp(-40 * (de**2).sum((1, 2)))
+    np.testing.assert_allclose(rewards.world_end_effector(a, b, layout.end_effectors, 40.0), expected, rtol=1e-9)
+    root = (scipy(a["qpos"][:, 3:7]) * scipy(b["qpos"][:, 3:7]).inv()).magnitude()
+    without_root = rewards.pose(a, b, layout.parents, 2.0, "angle").numpy()
+    expected = without_root * np.exp(-2 * root**2)
+    np.testing.assert_allclose(rewards.world_pose(a, b, layout.parents, 2.0, "angle"), expected, rtol=1e-9)
+
+
+@given(yaw=st.floats(-10, 10), x=st.floats(-50, 50), y=st.floats(-50, 50))
+@settings(max_examples=30, deadline=None)
+def test_heading_turn_and_travel_change_nothing(body, yaw: float, x: float, y: float) -> None:
+    _, reference, layout = body
+    a, b = reference[:10], reference[10:20]
+    reward = rewards.HeadingFrameReward(WEIGHTS, SCALES)
+    step = torch.zeros(10, dtype=torch.int64)
+    here, there = reward(a, b, layout, step)[0], reward(moved(a, yaw, (x, y)), b, layout, step)[0]
+    np.testing.assert_allclose(here, there, rtol=1e-7)
+    z = obs.humanoid_state(a)
+    np.testing.assert_allclose(z, obs.humanoid_state(moved(a, yaw, (x, y))), atol=1e-9)
+
+
+def test_deepmimic_sees_travel(body) -> None:
+    _, reference, layout = body
+    a = reference[:10]
+    reward = rewards.WorldFrameReward(WORLD_WEIGHTS, WORLD)
+    total, terms = reward(moved(a, 0.0, (0.5, 0.0)), a, layout, torch.zeros(10))
+    assert (terms["pose"] == 1).all()
+    assert (terms["centre_of_mass"] < 0.1).all()
+    assert (total < 0.95).all()
+
+
+@pytest.mark.parametrize(
+    "reward",
+    [
+        rewards.HeadingFrameReward(WEIGHTS, SCALES),
+        rewards.HeadingFrameReward(WEIGHTS, SCALES, "angle"),
+        rewards.HeadingFrameReward({"pose": 0.5, "end_effector": 0.3, "root_pose": 0.0, "root_velocity": 0.0}, SCALES),
+        rewards.WorldFrameReward(WORLD_WEIGHTS, WORLD),
+    ],
+)
+def test_the_reference_itself_is_worth_one(body, reward: rewards.Reward) -> None:
+    _, reference, layout = body
+    total, terms = reward(reference, reference, layout, torch.zeros(len(reference)))
+    np.testing.assert_allclose(total, 1, atol=1e-12)
+    assert set(terms) == set(reward.names)
+    # q and -q are one rotation.
+    flipped = reference.clone()
+    flipped["xquat"] = -flipped["xquat"]
+    flipped["qpos"][:, 3:7] *= -1
+    np.testing.assert_allclose(reward(flipped, reference, layout, torch.zeros(len(reference)))[0], 1, atol=1e-9)
+    np.testing.assert_allclose(obs.humanoid_state(flipped), obs.humanoid_state(reference), atol=1e-12)
+
+
+def test_total_is_divided_by_the_weights(body) -> None:
+    _, reference, layout = body
+    a, b, step = reference[:10], reference[10:20], torch.zeros(10)
+    double = {k: 2 * w for k, w in WEIGHTS.items()}
+    one, terms = rewards.HeadingFrameReward(WEIGHTS, SCALES)(a, b, layout, step)
+    np.testing.assert_allclose(one, rewards.HeadingFrameReward(double, SCALES)(a, b, layout, step)[0])
+    np.testing.assert_allclose(one, sum(WEIGHTS[k] * v for k, v in terms.items()), rtol=1e-12)
+
+
+def test_forecasting_decays_linearly(body) -> None:
+    _, reference, layout = body
+    step = torch.tensor([0, 45, 90, 120])
+    reward = rewards.HeadingFrameReward(WEIGHTS, SCALES, decay_horizon=90)
+    total, _ = reward(reference[:4], reference[:4], layout, step)
+    np.testing.assert_allclose(total, [1.0, 0.5, 0.0, 0.0], atol=1e-12)
+
+
+def test_bad_reward_settings_are_refused() -> None:
+    with pytest.raises(ValueError, match="weights"):
+        rewards.HeadingFrameReward({"pose": 1.0}, SCALES)
+    with pytest.raises(ValueError, match="all zero"):
+        rewards.HeadingFrameReward(dict.fromkeys(WEIGHTS, 0.0), SCALES)
+    with pytest.raises(ValueError, match="rotation_metric"):
+        rewards.rotation_size(random_quats(1), "degrees")
+    with pytest.raises(ValueError, match="kind"):
+        rewards.build_reward({"kind": "nice", "weights": WEIGHTS, "scales": SCALES})
+
+
+def test_fall_is_a_head_below_the_take(body) -> None:
+    humanoid, reference, _ = body
+    state = reference[:2].clone()
+    state["xpos"][:, humanoid.head, 2] = torch.tensor([1.41, 1.39], dtype=torch.float64)
+    assert fallen(state, humanoid.head, torch.full((2,), 1.5, dtype=torch.float64), 0.1).tolist() == [False, True]
