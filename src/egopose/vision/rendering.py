@@ -1,0 +1,281 @@
+"""Pictures of a motion: the wearer's own view from a camera on the head, and the view from beside.
+
+Rendering is MuJoCo's, without shadows and multisampling: on a CPU these cost eight times the rest.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from os import PathLike
+from types import TracebackType
+
+import cv2
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from egopose.motion.rotations import Array, from_axis_angle, from_scipy, multiply, to_scipy
+from egopose.vision.gl import open_context
+from egopose.vision.rooms import Range, RoomConfig, draw_room, furnish
+from egopose.vision.video import Frame, write_video
+
+WEARER_CAMERA = "head"
+# Distances of the near and far clipping planes: nearer than the hands come to the eyes, further than any room.
+_NEAR, _FAR = 0.03, 60.0
+# The body's reach above its root, for the ceiling.
+_REACH = 1.2
+
+
+@dataclass(frozen=True)
+class CameraConfig:
+    """How cameras are worn, in degrees and seconds (``conf/vision/rendered.yaml``): ranges a take draws from."""
+
+    field_of_view: Range
+    pitch_down: Range
+    roll: Range
+    yaw: Range
+    shake: Range
+    shake_time: float
+
+
+@dataclass(frozen=True)
+class WearerCamera:
+    """One take's camera: field of view (degrees), mounting yaw, pitch down, roll (rad), and its play (rad, s)."""
+
+    field_of_view: float
+    yaw: float
+    pitch_down: float
+    roll: float
+    shake: float
+    shake_time: float
+
+    @staticmethod
+    def draw(rng: np.random.Generator, config: CameraConfig) -> WearerCamera:
+        """A camera from the config's ranges."""
+        yaw, pitch, roll, shake = (
+            float(np.deg2rad(rng.uniform(*r))) for r in (config.yaw, config.pitch_down, config.roll, config.shake)
+        )
+        return WearerCamera(float(rng.uniform(*config.field_of_view)), yaw, pitch, roll, shake, config.shake_time)
+
+    def angles(self, rng: np.random.Generator, count: int, fps: float) -> Array:
+        """``[count, 3]`` yaw, pitch down, roll (rad) of each frame: the mounting and its play, correlated in time."""
+        keep = float(np.exp(-1.0 / (self.shake_time * fps)))
+        noise = rng.normal(scale=self.shake, size=(count, 3))
+        for t in range(1, count):
+            noise[t] = keep * noise[t - 1] + np.sqrt(1 - keep**2) * noise[t]
+        return np.array([self.yaw, self.pitch_down, self.roll]) + noise
+
+
+class SceneRenderer:
+    """Renders poses of a compiled model; a context manager that gives its OpenGL back.
+
+    Args:
+        model: any MuJoCo model; it is copied.
+        width, height: of the pictures, pixels.
+
+    Raises:
+        RuntimeError: no OpenGL here; the message says what to install.
+    """
+
+    def __init__(self, model: mujoco.MjModel, width: int, height: int) -> None:
+        self.model = copy.copy(model)
+        visual = self.model.vis
+        visual.global_.offwidth, visual.global_.offheight = max(width, 64), max(height, 64)
+        visual.quality.offsamples = 0
+        visual.quality.shadowsize = 0
+        visual.map.znear, visual.map.zfar = _NEAR / self.model.stat.extent, _FAR / self.model.stat.extent
+        self.data = mujoco.MjData(self.model)
+        self._pixels = np.empty((height, width, 3), np.uint8)
+        self._rect = mujoco.MjrRect(0, 0, width, height)
+        self._scene = mujoco.MjvScene(self.model, maxgeom=self.model.ngeom + 200)
+        self._scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = 0
+        self._scene.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = 0
+        self._options = mujoco.MjvOption()
+        self._gl = open_context(width, height)
+        self._context = mujoco.MjrContext(self.model, mujoco.mjtFontScale.mjFONTSCALE_100)
+        mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._context)
+
+    def __enter__(self) -> SceneRenderer:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Free the context; a second call does nothing."""
+        if self._gl is not None:
+            self._gl.make_current()
+            self._context.free()
+            self._gl.free()
+            self._gl = None
+
+    def render(self, qpos: Array, camera: str | mujoco.MjvCamera) -> Frame:
+        """The picture ``[height, width, 3]`` of pose ``qpos [nq]`` by a camera of the model or a free one.
+
+        Raises:
+            ValueError: qpos is of another length; after :meth:`close`.
+            KeyError: the model has no camera of that name.
+        """
+        if self._gl is None:
+            raise ValueError("the renderer is closed")
+        self.data.qpos[:] = qpos
+        mujoco.mj_kinematics(self.model, self.data)
+        mujoco.mj_comPos(self.model, self.data)
+        mujoco.mj_camlight(self.model, self.data)
+        if isinstance(camera, str):
+            view = mujoco.MjvCamera()
+            view.type = mujoco.mjtCamera.mjCAMERA_FIXED
+            view.fixedcamid = self.model.camera(camera).id
+        else:
+            view = camera
+        self._gl.make_current()
+        every = mujoco.mjtCatBit.mjCAT_ALL
+        mujoco.mjv_updateScene(self.model, self.data, self._options, None, view, every, self._scene)
+        mujoco.mjr_render(self._rect, self._scene, self._context)
+        mujoco.mjr_readPixels(self._pixels, None, self._rect, self._context)
+        return np.flipud(self._pixels).copy()
+
+
+def camera_orientations(model: mujoco.MjModel, angles: Array) -> NDArray[np.float64]:
+    """Quaternions ``[T, 4]`` of the wearer's camera in the head's frame, from yaw, pitch down, roll ``[T, 3]`` (rad).
+
+    The angles are meant as they would be measured on a person standing straight: the model's rest pose says where
+    the head looks then, and its camera ``head`` only in which direction.
+    """
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    mujoco.mj_camlight(model, data)
+    camera = model.camera(WEARER_CAMERA).id
+    ahead = -data.cam_xmat[camera].reshape(3, 3)[:, 2]
+    heading = from_axis_angle(np.array([0.0, 0.0, 1.0]), np.arctan2(ahead[1], ahead[0]))
+    # MuJoCo's camera looks along -z with x to its right: level and along the world's x, in columns.
+    level = from_scipy(to_scipy(np.array([[0.5, 0.5, -0.5, -0.5]])), (1,))[0]
+    turns = [
+        from_axis_angle(np.array(axis), sign * angles[:, column])
+        for axis, sign, column in (((0.0, 1.0, 0.0), 1.0, 0), ((1.0, 0.0, 0.0), -1.0, 1), ((0.0, 0.0, 1.0), 1.0, 2))
+    ]
+    head = data.xquat[model.cam_bodyid[camera]] * np.array([1.0, -1.0, -1.0, -1.0])
+    fixed = multiply(multiply(head, heading), level)
+    return multiply(multiply(multiply(np.broadcast_to(fixed, (len(angles), 4)), turns[0]), turns[1]), turns[2])
+
+
+def wearer_frames(
+    model_xml: str,
+    qpos: Array,
+    *,
+    room_seed: int,
+    take_seed: int,
+    room: RoomConfig,
+    camera: CameraConfig,
+    size: int,
+    fps: float,
+) -> Iterator[Frame]:
+    """What the wearer's head camera sees, frame by frame.
+
+    Args:
+        model_xml: the humanoid's MJCF with a camera ``head`` on its head.
+        qpos: ``[T, nq]`` at ``fps``.
+        room_seed: which room (:func:`egopose.vision.rooms.room_seed`).
+        take_seed: how the camera is worn and shakes.
+        room, camera: ranges.
+        size: side of the square pictures, pixels.
+        fps: frames per second.
+
+    Raises:
+        ValueError: no frames, or the model has no camera ``head`` or another number of coordinates.
+        RuntimeError: no OpenGL here.
+    """
+    if len(qpos) == 0:
+        raise ValueError("a motion without frames cannot be rendered")
+    spec = mujoco.MjSpec.from_string(model_xml)
+    mount = spec.camera(WEARER_CAMERA)
+    if mount is None:
+        raise ValueError(f"the model has no camera {WEARER_CAMERA!r}")
+    furnish(spec, draw_room(room_seed, qpos[:, :2], float(qpos[:, 2].max()) + _REACH, room), room)
+    for geom in mount.parent.geoms:
+        # Seen from inside, one's own head is nothing but an obstacle.
+        geom.material, geom.rgba = "", [0, 0, 0, 0]
+    model = spec.compile()
+    if qpos.shape[1] != model.nq:
+        raise ValueError(f"qpos has {qpos.shape[1]} coordinates, the model {model.nq}")
+    rng = np.random.default_rng([take_seed, 2])
+    worn = WearerCamera.draw(rng, camera)
+    orientations = camera_orientations(model, worn.angles(rng, len(qpos), fps))
+    with SceneRenderer(model, size, size) as renderer:
+        index = model.camera(WEARER_CAMERA).id
+        renderer.model.cam_fovy[index] = worn.field_of_view
+        for pose, orientation in zip(qpos, orientations, strict=True):
+            renderer.model.cam_quat[index] = orientation
+            yield renderer.render(pose, WEARER_CAMERA)
+
+
+def render_wearer_video(
+    model_xml: str,
+    qpos: Array,
+    path: str | PathLike[str],
+    *,
+    room_seed: int,
+    take_seed: int,
+    room: RoomConfig,
+    camera: CameraConfig,
+    size: int,
+    fps: float,
+) -> None:
+    """Write :func:`wearer_frames` to an MP4, whole or not at all. Raises as it and as ``VideoWriter``."""
+    frames = wearer_frames(
+        model_xml, qpos, room_seed=room_seed, take_seed=take_seed, room=room, camera=camera, size=size, fps=fps
+    )
+    write_video(path, frames, fps)
+
+
+def side_view_frames(
+    model: mujoco.MjModel, motions: Sequence[Array], labels: Sequence[str], size: int, azimuth: float = 120.0
+) -> Iterator[Frame]:
+    """Motions beside each other, each followed by a camera that keeps its root in the middle.
+
+    Args:
+        model: the humanoid with its floor.
+        motions: one or more ``[T, nq]``; the shortest decides the length.
+        labels: one a motion, written into its panel.
+        size: side of a panel, pixels; a frame is ``[size, size * len(motions), 3]``.
+        azimuth: from where the cameras look, degrees about z.
+
+    Raises:
+        RuntimeError: no OpenGL here.
+    """
+    view = mujoco.MjvCamera()
+    view.type = mujoco.mjtCamera.mjCAMERA_FREE
+    view.distance, view.elevation, view.azimuth = 3.2, -12.0, azimuth
+    with SceneRenderer(model, size, size) as renderer:
+        for poses in zip(*motions, strict=False):
+            panels = []
+            for pose, label in zip(poses, labels, strict=True):
+                view.lookat = [pose[0], pose[1], 0.85]
+                panels.append(label_frame(renderer.render(pose, view), label))
+            yield np.concatenate(panels, axis=1)
+
+
+def render_side_view(
+    model: mujoco.MjModel,
+    motions: Sequence[Array],
+    labels: Sequence[str],
+    path: str | PathLike[str],
+    size: int,
+    fps: float,
+) -> None:
+    """Write :func:`side_view_frames` to an MP4."""
+    write_video(path, side_view_frames(model, motions, labels, size), fps)
+
+
+def label_frame(frame: Frame, label: str) -> Frame:
+    """A copy of the frame with a line of text at its upper left, readable on any ground."""
+    frame = frame.copy()
+    scale = frame.shape[0] / 480
+    at = (int(10 * scale) + 2, int(30 * scale) + 4)
+    for colour, thickness in (((0, 0, 0), 3), ((255, 255, 255), 1)):
+        cv2.putText(frame, label, at, cv2.FONT_HERSHEY_SIMPLEX, max(scale, 0.4), colour, thickness, cv2.LINE_AA)
+    return frame
