@@ -9,7 +9,7 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -18,6 +18,7 @@ from torch import Tensor, nn
 from torchrl.envs.utils import ExplorationType
 from torchrl.modules import MLP, IndependentNormal, ProbabilisticActor, ValueOperator
 
+from egopose.config import from_mapping
 from egopose.errors import InputError
 from egopose.models.context import BidirectionalContext
 from egopose.models.episode_context import EpisodeContext, episode_context_module
@@ -71,31 +72,19 @@ class PolicySettings:
     @classmethod
     def from_config(cls, config: Mapping[str, Any]) -> PolicySettings:
         """From the resolved config group. Raises InputError naming the setting that is missing, unknown or wrong."""
-        top = _exactly(cls, config, "model")
-        context = ContextSettings(**_exactly(ContextSettings, top["context"], "model.context"))
-        critic = _exactly(CriticSettings, top["critic"], "model.critic")
-        if context.source not in ("frozen", "trainable"):
-            raise InputError("model", "context.source", f"must be frozen or trainable, not {context.source!r}")
-        if top["activation"] not in _ACTIVATIONS:
+        parts: dict[str, Any] = {
+            name: from_mapping(part, config[name], f"model.{name}")
+            for name, part in (("context", ContextSettings), ("critic", CriticSettings))
+            if name in config
+        }
+        settings = from_mapping(cls, {**config, **parts}, "model")
+        if settings.context.source not in ("frozen", "trainable"):
+            raise InputError("model", "context.source", f"must be frozen or trainable, not {settings.context.source!r}")
+        if settings.activation not in _ACTIVATIONS:
             raise InputError("model", "activation", f"must be one of {', '.join(_ACTIVATIONS)}")
-        if not top["sigma"] > 0:
-            raise InputError("model", "sigma", f"must be positive, not {top['sigma']}")
-        return cls(
-            **{
-                **top,
-                "hidden": tuple(top["hidden"]),
-                "context": context,
-                "critic": CriticSettings(tuple(critic["hidden"]), tuple(critic["privileged"])),
-            }
-        )
-
-
-def _exactly(settings: type, config: Mapping[str, Any], source: str) -> dict[str, Any]:
-    """``config`` as keyword arguments of a settings class, no more and no fewer."""
-    wanted = {f.name for f in fields(settings)}
-    for name in sorted(wanted ^ set(config)):
-        raise InputError(source, str(name), "is missing" if name in wanted else "is not a setting of this group")
-    return dict(config)
+        if not settings.sigma > 0:
+            raise InputError("model", "sigma", f"must be positive, not {settings.sigma}")
+        return settings
 
 
 class GaussianHead(nn.Module):

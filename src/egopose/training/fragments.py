@@ -1,0 +1,65 @@
+"""Stretches of the store's frames, and the windows a training epoch is made of."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+
+class Span(NamedTuple):
+    """Consecutive frames ``start .. stop - 1`` of one take, in global frames of the store."""
+
+    start: int
+    stop: int
+
+
+class Window(NamedTuple):
+    """What the BiLSTM sees, ``start .. stop - 1``, and the frames among it that carry loss."""
+
+    start: int
+    stop: int
+    loss_start: int
+    loss_stop: int
+
+    def carries_loss(self) -> Tensor:
+        """``[stop - start]`` booleans."""
+        frame = torch.arange(self.start, self.stop)
+        return (frame >= self.loss_start) & (frame < self.loss_stop)
+
+
+def split_validation(fragments: Sequence[Span], share: float, margin: int) -> tuple[list[Span], list[tuple[Span, int]]]:
+    """Training fragments, and held-out ones with the count of frames before the first that is judged.
+
+    The end of each fragment is held out. The ``margin`` frames before it belong to neither: they are the held-out
+    part's context. A fragment too short to give more than ``margin`` frames is trained on whole.
+    """
+    train, held_out = [], []
+    for fragment in fragments:
+        count = round(share * (fragment.stop - fragment.start))
+        if count <= margin:
+            train.append(fragment)
+            continue
+        cut = fragment.stop - count
+        train.append(fragment._replace(stop=cut - margin))
+        held_out.append((fragment._replace(start=cut - margin), margin))
+    return train, held_out
+
+
+def training_windows(fragments: Sequence[Span], length: int, margin: int, generator: torch.Generator) -> list[Window]:
+    """One epoch's windows, in random order.
+
+    Windows tile each fragment at a new random phase; each frame carries loss in exactly one window.
+    """
+    stride = length - 2 * margin
+    windows = []
+    for begin, end in fragments:
+        phase = int(torch.randint(stride, (1,), generator=generator))
+        edges = [begin, *range(begin + stride - phase, end, stride), end]
+        for a, b in itertools.pairwise(edges):
+            windows.append(Window(max(a - margin, begin), min(b + margin, end), a, b))
+    order = torch.randperm(len(windows), generator=generator)
+    return [windows[i] for i in order.tolist()]
