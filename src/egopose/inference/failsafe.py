@@ -24,7 +24,6 @@ class FailSafe:
     Attributes:
         confidence: list over calls of ``[N]`` float64: V(s_t) over its running mean (1 at the first frame; NaN for
             worlds that were not active).
-        resets: ``[N]`` int64, how often each world was reset.
 
     Raises:
         ValueError: an unknown mode.
@@ -35,7 +34,6 @@ class FailSafe:
             raise ValueError(f"fail-safe mode {mode!r}; choose from {', '.join(MODES)}")
         self.mode, self.kappa, self.fallen_height = mode, kappa, fallen_height
         self.confidence: list[Tensor] = []
-        self.resets = torch.zeros(worlds, dtype=torch.int64)
         self._sum = torch.zeros(worlds, dtype=torch.float64)
         self._count = torch.zeros(worlds, dtype=torch.float64)
 
@@ -60,9 +58,7 @@ class FailSafe:
         mean = self._sum / self._count.clamp(min=1)
         ratio = torch.where(mean > 0, value / mean, torch.ones_like(value))
         self.confidence.append(torch.where(active, ratio, torch.full_like(ratio, float("nan"))))
-        triggered = active & self._unstable(ratio, head_height)
-        self.resets += triggered
-        return triggered
+        return active & self._unstable(ratio, head_height)
 
     def _unstable(self, ratio: Tensor, head_height: Tensor) -> Tensor:
         if self.mode == "value":

@@ -1,0 +1,183 @@
+"""Which figures a take gets, and how methods are compared over takes and training runs.
+
+A figure is the mean over a take's frames; a table's figure is the unweighted mean over takes, then over runs (the
+paper's protocol), with a bootstrap interval over both.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from egopose.evaluation import metrics, position_metrics
+from egopose.evaluation.statistics import Interval, mean_interval, ratio_interval
+from egopose.humanoid.model import HumanoidModel
+from egopose.motion import rotations as rot
+from egopose.motion.contacts import contact_labels
+from egopose.motion.kinematics import forward_kinematics
+from egopose.motion.rotations import Array
+
+CONTACT_HEIGHT = 0.03  # m: a sole point this near the ground ...
+CONTACT_SPEED = 0.4  # m/s: ... and slower than this stands on it
+
+
+@dataclass(frozen=True)
+class Metric:
+    """How a figure is shown: smaller is better for all of them but ``contact_accuracy``."""
+
+    key: str
+    label: str
+    unit: str
+    decimals: int
+    scale: float = 1.0
+
+
+METRICS = (
+    Metric("E_pose", "E_pose", "rad", 3),
+    Metric("E_vel", "E_vel", "", 3),
+    Metric("A_accl", "A_accl", "", 3),
+    Metric("A_accl_actuated", "A_accl (actuated)", "rad/s^2", 3),
+    Metric("mpjpe", "MPJPE", "mm", 1, 1e3),
+    Metric("mpjpe_root_aligned", "MPJPE, roots aligned", "mm", 1, 1e3),
+    Metric("mpjpe_procrustes", "PA-MPJPE", "mm", 1, 1e3),
+    Metric("wa_mpjpe", "WA-MPJPE", "mm", 1, 1e3),
+    Metric("w_mpjpe", "W-MPJPE", "mm", 1, 1e3),
+    Metric("root_translation_error", "root translation error", "mm", 1, 1e3),
+    Metric("root_drift", "root drift", "mm", 1, 1e3),
+    Metric("foot_skate", "foot skate", "mm/s", 1, 1e3),
+    Metric("ground_penetration", "ground penetration", "mm", 2, 1e3),
+    Metric("contact_accuracy", "contact accuracy", "%", 1, 1e2),
+    Metric("jitter", "jitter", "m/s^3", 1),
+)
+
+
+@dataclass(frozen=True)
+class TakeScores:
+    """The figures of one method on one take.
+
+    Args:
+        name: of the take (with its frames, where it is a fragment).
+        frames: per-frame figures, each of at most T values: metrics of differences have fewer and end with the take.
+        scalars: figures that are no mean over frames (``foot_skate``).
+        resets: how often the fail-safe restarted the humanoid; 0 for kinematic methods.
+    """
+
+    name: str
+    frames: Mapping[str, Array]
+    scalars: Mapping[str, float] = field(default_factory=dict)
+    resets: int = 0
+
+    def figure(self, key: str) -> float:
+        """The take's value of a metric: the mean over its frames; NaN where it has none."""
+        if key in self.scalars:
+            return self.scalars[key]
+        return float(np.mean(self.frames[key])) if key in self.frames else float("nan")
+
+
+def score_take(name: str, estimate: Array, reference: Array, humanoid: HumanoidModel, resets: int = 0) -> TakeScores:
+    """All figures of an estimated ``qpos [T, nq]`` against the reference's.
+
+    Raises:
+        ValueError: shapes differ, or fewer than 4 frames.
+    """
+    hands, fps = [int(d) for d in humanoid.hand_dofs], 1.0 / humanoid.control_dt
+    body = forward_kinematics(humanoid.skeleton, estimate)
+    truth = forward_kinematics(humanoid.skeleton, reference)
+    positions, true_positions = body[0], truth[0]
+    soles, true_soles = sole_positions(humanoid, *body), sole_positions(humanoid, *truth)
+    contacts, true_contacts = (
+        contact_labels(points, fps, height=CONTACT_HEIGHT, speed=CONTACT_SPEED) for points in (soles, true_soles)
+    )
+    frames = {
+        "E_pose": metrics.pose_error(estimate, reference, hands),
+        "E_vel": metrics.velocity_error(estimate, reference, hands, fps),
+        "A_accl": metrics.acceleration(estimate, hands, fps),
+        "A_accl_actuated": metrics.acceleration_actuated(estimate, hands, fps),
+        "mpjpe": position_metrics.mpjpe(positions, true_positions),
+        "mpjpe_root_aligned": position_metrics.mpjpe_root_aligned(positions, true_positions),
+        "mpjpe_procrustes": position_metrics.mpjpe_procrustes(positions, true_positions),
+        "wa_mpjpe": position_metrics.wa_mpjpe(positions, true_positions),
+        "w_mpjpe": position_metrics.w_mpjpe(positions, true_positions),
+        "root_translation_error": position_metrics.root_translation_error(positions[:, 0], true_positions[:, 0]),
+        "root_drift": position_metrics.root_drift(positions[:, 0], true_positions[:, 0]),
+        "ground_penetration": position_metrics.ground_penetration(soles),
+        "contact_accuracy": position_metrics.contact_accuracy(contacts, true_contacts),
+        "jitter": position_metrics.jitter(positions, fps),
+    }
+    return TakeScores(name, frames, {"foot_skate": position_metrics.foot_skate(soles, contacts, fps)}, resets)
+
+
+def sole_positions(humanoid: HumanoidModel, positions: Array, quats: Array) -> Array:
+    """Heel and ball of every foot in the world, ``[T, 2 * feet, 3]`` m, from joint positions and quaternions."""
+    feet = humanoid.feet
+    quat = np.broadcast_to(quats[:, feet, None, :], (len(quats), len(feet), 2, 4))
+    points = np.broadcast_to(humanoid.sole_points, (len(quats), len(feet), 2, 3))
+    return (positions[:, feet, None, :] + rot.rotate(quat, points)).reshape(len(quats), -1, 3)
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Methods by metrics.
+
+    Attributes:
+        takes: names of the takes, in order.
+        figures: ``figures[method][metric]``, in the units of :data:`METRICS`.
+        ratios: ``ratios[method][metric]`` to ``baseline`` on the same takes.
+        baseline: the method others are divided by.
+        resets: mean over runs of the sum over takes.
+        per_take: ``per_take[method][metric][run][take]``.
+    """
+
+    takes: tuple[str, ...]
+    figures: Mapping[str, Mapping[str, Interval]]
+    ratios: Mapping[str, Mapping[str, Interval]]
+    baseline: str
+    resets: Mapping[str, float]
+    per_take: Mapping[str, Mapping[str, list[list[float]]]]
+
+
+def compare(
+    methods: Mapping[str, Sequence[Sequence[TakeScores]]], baseline: str, level: float = 0.95, draws: int = 2000
+) -> Comparison:
+    """Means with intervals over runs and takes, and ratios to the baseline on the same takes.
+
+    Args:
+        methods: per method its runs (training seeds), per run its takes; all runs on the same takes in the same order.
+        baseline: one of ``methods``; it has one run, or as many as each of the others.
+        level: of the intervals.
+        draws: of the bootstrap.
+
+    Raises:
+        ValueError: the baseline is missing or the takes differ.
+    """
+    if baseline not in methods:
+        raise ValueError(f"no method {baseline!r} to compare with; there are {', '.join(methods)}")
+    takes = tuple(s.name for s in methods[baseline][0])
+    for method, runs in methods.items():
+        for run in runs:
+            if tuple(s.name for s in run) != takes:
+                raise ValueError(f"{method} was not scored on the takes of {baseline}")
+    scores = {
+        method: {m.key: np.array([[m.scale * take.figure(m.key) for take in run] for run in runs]) for m in METRICS}
+        for method, runs in methods.items()
+    }
+    figures = {
+        method: {k: mean_interval(v, level, draws) for k, v in table.items() if np.isfinite(v).any()}
+        for method, table in scores.items()
+    }
+    ratios = {
+        method: {
+            k: ratio_interval(v, scores[baseline][k], level, draws)
+            for k, v in table.items()
+            if k in figures[method] and k in figures[baseline] and figures[baseline][k].value > 0
+        }
+        for method, table in scores.items()
+        if method != baseline
+    }
+    resets = {
+        method: float(np.mean([sum(take.resets for take in run) for run in runs])) for method, runs in methods.items()
+    }
+    per_take = {method: {k: v.tolist() for k, v in table.items()} for method, table in scores.items()}
+    return Comparison(takes, figures, ratios, baseline, resets, per_take)

@@ -1,0 +1,157 @@
+"""From a policy and the wearer's video to motion: one pass over whole takes, all takes side by side.
+
+Yuan & Kitani 2019, sections 3.1 and 3.3: the first state is the regressor's, placed where the person stands and faces;
+from there the policy's mean action drives the humanoid. Where the fail-safe triggers at frame t, the humanoid restarts
+at frame t + 1 from the regressor's state, at its own place and heading.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from tensordict import TensorDictBase
+from torch import Tensor, nn
+from torchrl.envs import TransformedEnv
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+
+from egopose.envs.env import EgoPoseEnv
+from egopose.envs.transforms import StateNormalizer
+from egopose.humanoid.model import HumanoidModel
+from egopose.inference.failsafe import FailSafe
+from egopose.models.episode_context import EpisodeContext
+from egopose.models.pose_regression import state_to_qpos
+from egopose.motion import rotations as rot
+from egopose.motion.motion import Motion
+from egopose.motion.rotations import Array
+
+#: What writes ``action`` (an actor: its mean action is taken) or ``state_value`` into an observation.
+Controller = Callable[[TensorDictBase], TensorDictBase]
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """One take as the policy moved through it.
+
+    Attributes:
+        start: global frame of the first row; the rows are frames ``start .. start + T - 1``.
+        qpos: ``[T, nq]``.
+        value: ``[T]`` V(s_t).
+        confidence: ``[T]`` V(s_t) over its running mean, see :class:`~egopose.inference.failsafe.FailSafe`.
+        resets: ``[T]`` frames whose state is the regressor's because the fail-safe triggered or the physics broke just
+            before. The first frame is not counted.
+        fallen: ``[T]`` frames in which the head is too low for the take.
+        diverged: how often the physics broke.
+    """
+
+    start: int
+    qpos: Array
+    value: Array
+    confidence: Array
+    resets: NDArray[np.bool_]
+    fallen: NDArray[np.bool_]
+    diverged: int
+
+    @property
+    def n_resets(self) -> int:
+        """N_reset of the take."""
+        return int(self.resets.sum())
+
+    def motion(self, humanoid: HumanoidModel, name: str) -> Motion:
+        """The estimate as a :class:`Motion` of the humanoid's skeleton."""
+        return Motion(
+            humanoid.skeleton, self.qpos, 1.0 / humanoid.control_dt, name, meta={"source": "estimated by egopose"}
+        )
+
+
+@torch.no_grad()
+def estimate_takes(
+    env: TransformedEnv,
+    actor: Controller,
+    critic: Controller,
+    states: Tensor,
+    guard: FailSafe,
+) -> list[Estimate]:
+    """Run every world's fragment from its first frame to its last.
+
+    The normaliser is frozen and the context networks see the take to its end, both for good.
+
+    Args:
+        env: over :class:`EgoPoseEnv` with ``WholeFragments`` starts and falls that do not end the episode; world i's
+            fragment is take i.
+        actor, critic: policy and value network.
+        states: ``[F, 2 nq - 3]`` the regressor's humanoid state of every global frame.
+        guard: the fail-safe, of as many worlds.
+
+    Returns:
+        One :class:`Estimate` a world; fragments may differ in length.
+    """
+    base = env.base_env
+    assert isinstance(base, EgoPoseEnv)
+    prepare_for_test(env, actor, critic)
+    first = env.reset()
+    start, stop = first["episode_start"].squeeze(-1), first["episode_stop"].squeeze(-1)
+    lengths = stop - start
+    worlds = torch.arange(len(start))
+    _restart(base, worlds, states[start], base.body_state()["qpos"])
+    observation = env.transform(base.observe())
+
+    rows: dict[str, list[Tensor]] = {name: [] for name in ("qpos", "value", "resets", "fallen", "diverged")}
+    placed, diverged = torch.zeros_like(worlds, dtype=torch.bool), torch.zeros_like(worlds, dtype=torch.bool)
+    with set_exploration_type(ExplorationType.DETERMINISTIC):
+        for t in range(int(lengths.max())):
+            body = base.body_state()
+            observation = critic(actor(observation))
+            value = observation["state_value"].squeeze(-1)
+            triggered = guard.update(value, body["xpos"][:, base.problem.humanoid.head, 2], t < lengths)
+            frame = (body["qpos"], value, placed, observation["fallen"].squeeze(-1), diverged)
+            for name, column in zip(rows, frame, strict=True):
+                rows[name].append(column)
+            if t + 1 == int(lengths.max()):
+                break
+            after = env.step(observation)["next"]
+            diverged = after["diverged"].squeeze(-1)
+            placed = (triggered | diverged) & (t + 1 < lengths)
+            again = placed.nonzero().squeeze(-1)
+            if len(again):
+                _restart(base, again, states[start[again] + t + 1], body["qpos"][again])
+                after = env.transform(base.observe())
+            observation = after.exclude("reward", "action")
+    table = {name: torch.stack(column, dim=1).numpy() for name, column in rows.items()}
+    confidence = torch.stack(guard.confidence, dim=1).numpy()
+    return [
+        Estimate(
+            start=int(start[i]),
+            qpos=table["qpos"][i, :n],
+            value=table["value"][i, :n].astype(np.float64),
+            confidence=confidence[i, :n],
+            resets=table["resets"][i, :n],
+            fallen=table["fallen"][i, :n],
+            diverged=int(table["diverged"][i, :n].sum()),
+        )
+        for i, n in enumerate(lengths.tolist())
+    ]
+
+
+def prepare_for_test(env: TransformedEnv, *controllers: Controller) -> None:
+    """Freeze the state normaliser and let trainable contexts see a take to its end in one pass."""
+    for module in env.transform.modules():
+        if isinstance(module, StateNormalizer):
+            module.freeze()
+    for network in controllers:
+        if not isinstance(network, nn.Module):
+            continue
+        network.eval()
+        for module in network.modules():
+            if isinstance(module, EpisodeContext):
+                module.horizon = None
+
+
+def _restart(base: EgoPoseEnv, worlds: Tensor, states: Tensor, qpos: Tensor) -> None:
+    """Put ``worlds [n]`` into the regressor's ``states [n, ...]`` at the place and heading of ``qpos [n, nq]``."""
+    where = qpos.numpy()
+    placed = state_to_qpos(states.numpy(), where[:, :2], rot.heading(where[:, 3:7]), base.problem.humanoid.joint_range)
+    base.place(worlds, *(torch.from_numpy(part) for part in placed))
