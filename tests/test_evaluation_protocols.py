@@ -12,9 +12,11 @@ from omegaconf import OmegaConf
 
 from egopose.config import config_dir
 from egopose.evaluation import tables
-from egopose.evaluation.protocols import METRICS, TakeScores, compare, score_take
+from egopose.evaluation.protocols import METRICS, ContactSettings, TakeScores, compare, score_take
 from egopose.humanoid.config import HumanoidConfig
 from egopose.humanoid.model import HumanoidModel, build_humanoid
+
+CONTACT = ContactSettings(height=0.05, speed=0.5)
 
 
 @pytest.fixture(scope="module")
@@ -43,7 +45,7 @@ def made_up(offset: float, seed: int, takes: int = 5) -> list[TakeScores]:
 
 def test_a_perfect_estimate_scores_nothing(humanoid: HumanoidModel) -> None:
     reference = standing(humanoid)
-    scores = score_take("walk", reference, reference, humanoid)
+    scores = score_take("walk", reference, reference, humanoid, CONTACT)
     for key in ("E_pose", "E_vel", "mpjpe", "w_mpjpe", "root_translation_error"):
         assert scores.figure(key) == pytest.approx(0, abs=1e-9)
     assert scores.figure("contact_accuracy") == 1
@@ -56,12 +58,12 @@ def test_known_faults_show_in_their_metric(humanoid: HumanoidModel) -> None:
     shifted, sunk = reference.copy(), reference.copy()
     shifted[:, 1] += 0.2
     sunk[:, 2] -= 0.5
-    assert score_take("a", shifted, reference, humanoid).figure("mpjpe") == pytest.approx(0.2)
-    assert score_take("a", shifted, reference, humanoid).figure("E_pose") == pytest.approx(0, abs=1e-12)
-    assert score_take("a", sunk, reference, humanoid).figure("ground_penetration") > 0.3
+    assert score_take("a", shifted, reference, humanoid, CONTACT).figure("mpjpe") == pytest.approx(0.2)
+    assert score_take("a", shifted, reference, humanoid, CONTACT).figure("E_pose") == pytest.approx(0, abs=1e-12)
+    assert score_take("a", sunk, reference, humanoid, CONTACT).figure("ground_penetration") > 0.3
     one_hand = reference.copy()
     one_hand[:, 7 + humanoid.hand_dofs] += 1.0
-    assert score_take("a", one_hand, reference, humanoid).figure("E_pose") == pytest.approx(0, abs=1e-12)
+    assert score_take("a", one_hand, reference, humanoid, CONTACT).figure("E_pose") == pytest.approx(0, abs=1e-12)
 
 
 def test_comparison_means_over_takes_then_runs() -> None:
@@ -103,7 +105,7 @@ def test_tables_say_the_same_in_every_form(tmp_path) -> None:
 
 
 def test_frames_csv_ends_with_the_take(tmp_path, humanoid: HumanoidModel) -> None:
-    scores = score_take("walk", standing(humanoid), standing(humanoid), humanoid)
+    scores = score_take("walk", standing(humanoid), standing(humanoid), humanoid, CONTACT)
     tables.write_frames_csv(tmp_path / "walk.csv", scores, {"confidence": np.ones(30)})
     with (tmp_path / "walk.csv").open() as stream:
         lines = list(csv.DictReader(stream))

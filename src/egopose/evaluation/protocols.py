@@ -11,16 +11,21 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from egopose.data.prepare_motion import sole_positions
 from egopose.evaluation import metrics, position_metrics
 from egopose.evaluation.statistics import Interval, mean_interval, ratio_interval
 from egopose.humanoid.model import HumanoidModel
-from egopose.motion import rotations as rot
 from egopose.motion.contacts import contact_labels
-from egopose.motion.kinematics import forward_kinematics
+from egopose.motion.motion import Motion
 from egopose.motion.rotations import Array
 
-CONTACT_HEIGHT = 0.03  # m: a sole point this near the ground ...
-CONTACT_SPEED = 0.4  # m/s: ... and slower than this stands on it
+
+@dataclass(frozen=True)
+class ContactSettings:
+    """When a sole point stands on the ground: at or below ``height`` (m) and no faster than ``speed`` (m/s)."""
+
+    height: float
+    speed: float
 
 
 @dataclass(frozen=True)
@@ -76,19 +81,20 @@ class TakeScores:
         return float(np.mean(self.frames[key])) if key in self.frames else float("nan")
 
 
-def score_take(name: str, estimate: Array, reference: Array, humanoid: HumanoidModel, resets: int = 0) -> TakeScores:
+def score_take(
+    name: str, estimate: Array, reference: Array, humanoid: HumanoidModel, contact: ContactSettings, resets: int = 0
+) -> TakeScores:
     """All figures of an estimated ``qpos [T, nq]`` against the reference's.
 
     Raises:
         ValueError: shapes differ, or fewer than 4 frames.
     """
     hands, fps = [int(d) for d in humanoid.hand_dofs], 1.0 / humanoid.control_dt
-    body = forward_kinematics(humanoid.skeleton, estimate)
-    truth = forward_kinematics(humanoid.skeleton, reference)
-    positions, true_positions = body[0], truth[0]
-    soles, true_soles = sole_positions(humanoid, *body), sole_positions(humanoid, *truth)
+    motions = [Motion(humanoid.skeleton, qpos, fps) for qpos in (estimate, reference)]
+    positions, true_positions = (motion.forward_kinematics()[0] for motion in motions)
+    soles, true_soles = (sole_positions(humanoid, motion) for motion in motions)
     contacts, true_contacts = (
-        contact_labels(points, fps, height=CONTACT_HEIGHT, speed=CONTACT_SPEED) for points in (soles, true_soles)
+        contact_labels(points, fps, height=contact.height, speed=contact.speed) for points in (soles, true_soles)
     )
     frames = {
         "E_pose": metrics.pose_error(estimate, reference, hands),
@@ -107,14 +113,6 @@ def score_take(name: str, estimate: Array, reference: Array, humanoid: HumanoidM
         "jitter": position_metrics.jitter(positions, fps),
     }
     return TakeScores(name, frames, {"foot_skate": position_metrics.foot_skate(soles, contacts, fps)}, resets)
-
-
-def sole_positions(humanoid: HumanoidModel, positions: Array, quats: Array) -> Array:
-    """Heel and ball of every foot in the world, ``[T, 2 * feet, 3]`` m, from joint positions and quaternions."""
-    feet = humanoid.feet
-    quat = np.broadcast_to(quats[:, feet, None, :], (len(quats), len(feet), 2, 4))
-    points = np.broadcast_to(humanoid.sole_points, (len(quats), len(feet), 2, 3))
-    return (positions[:, feet, None, :] + rot.rotate(quat, points)).reshape(len(quats), -1, 3)
 
 
 @dataclass(frozen=True)

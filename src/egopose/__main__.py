@@ -1,0 +1,40 @@
+"""``egopose VERB [key=value ...]``: one command, a verb for each main; ``python -m egopose.VERB`` is the same."""
+
+from __future__ import annotations
+
+import importlib
+import sys
+
+VERBS = {
+    "demo": "train a policy on the default data, evaluate it, show a table and a video",
+    "prepare": "turn motion files and videos into a store: retarget, render or decode, flow, features",
+    "train": "train a policy (Hydra: group=choice key=value, --multirun)",
+    "evaluate": "score a checkpoint on held-out takes beside PoseReg: tables, CSV, BVH, side-by-side MP4",
+    "estimate": "motion from a video alone: BVH and MP4",
+    "bench": "measure the environment's and the pipeline's speed",
+}
+
+
+def usage() -> str:
+    """The help text."""
+    width = max(map(len, VERBS))
+    verbs = "\n".join(f"  {verb.ljust(width)}  {what}" for verb, what in VERBS.items())
+    return f"usage: egopose VERB [key=value ...]\n\n{verbs}\n\negopose VERB --help says more of one."
+
+
+def main() -> None:
+    """Run the verb's own main, with the remaining arguments as its command line."""
+    arguments = sys.argv[1:]
+    if not arguments or arguments[0] in ("-h", "--help"):
+        print(usage())
+        raise SystemExit(0 if arguments else 2)
+    verb = arguments[0]
+    if verb not in VERBS:
+        print(f"error: no verb {verb!r}\n{usage()}", file=sys.stderr)
+        raise SystemExit(2)
+    sys.argv = [f"egopose {verb}", *arguments[1:]]
+    importlib.import_module(f"egopose.{verb}").main()
+
+
+if __name__ == "__main__":
+    main()
