@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -43,7 +44,14 @@ LOOP: dict[str, Any] = {
     "keep_last": 2,
     "evaluate_every": 0,
 }
-COLLECTOR: dict[str, Any] = {"kind": "sync", "workers": 1, "threads": 1, "update_threads": 1}
+COLLECTOR: dict[str, Any] = {
+    "kind": "sync",
+    "worlds": 8,
+    "physics_threads": 1,
+    "workers": 1,
+    "threads": 1,
+    "update_threads": 1,
+}
 CONFIG: dict[str, Any] = {"task": {"name": "toy"}, "seed": 3}
 
 
@@ -127,6 +135,11 @@ def make_env(worlds: int = 8, size: int = 2) -> TransformedEnv:
     return TransformedEnv(ToyEnv(worlds, size), StepCounter())
 
 
+def toy_worker(worlds: int, size: int, worker: int) -> TransformedEnv:
+    """The toy of one worker, at module level for other processes."""
+    return TransformedEnv(ToyEnv(worlds, size, seed=worker), StepCounter())
+
+
 class _Gaussian(nn.Module):
     def __init__(self, inputs: int, size: int) -> None:
         super().__init__()
@@ -158,5 +171,5 @@ def make_run(folder: Path, size: int = 2, worlds: int = 8, seed: int = 3, **sett
     actor, critic = networks(size)
     collector_settings = CollectorSettings.from_config({**COLLECTOR, **settings.pop("collector", {})})
     ppo = PPO(actor, critic, PPOSettings.from_config({**SETTINGS, **settings}))
-    collector = build_collector(collector_settings, lambda: make_env(worlds, size), actor, loop["steps_per_iteration"])
+    collector = build_collector(collector_settings, partial(toy_worker, worlds, size), actor, loop["steps_per_iteration"])
     return Run(ppo, collector, LoopSettings.from_config(loop), collector_settings, folder, config, action_size=size)

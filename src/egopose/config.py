@@ -6,6 +6,7 @@ import types
 import typing
 from collections.abc import Mapping
 from dataclasses import MISSING, fields
+from datetime import datetime
 from pathlib import Path
 from typing import Any, TypeVar, Union
 
@@ -99,3 +100,19 @@ def convert(value: Any, kind: Any, source: str, field: str) -> Any:
     if isinstance(value, kind) and not (kind is int and isinstance(value, bool)):
         return value
     raise InputError(source, field, f"must be {kind.__name__}, not {value!r}")
+
+
+def register_resolvers() -> None:
+    """``${run_directory:output,resume}`` for Hydra's run directory; may be called again."""
+    OmegaConf.register_new_resolver("run_directory", run_directory, replace=True, use_cache=True)
+
+
+def run_directory(output: str, resume: str | None) -> str:
+    """The directory being resumed, or one under ``output`` named after the time that is not there yet."""
+    if resume:
+        return str(resume)
+    first = Path(output) / datetime.now().strftime("%Y-%m-%d_%H-%M-%S")
+    folder, number = first, 2
+    while folder.exists():
+        folder, number = first.with_name(f"{first.name}_{number}"), number + 1
+    return str(folder)

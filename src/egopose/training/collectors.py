@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import torch
@@ -22,12 +23,16 @@ class CollectorSettings:
 
     Args:
         kind: ``sync`` in this process, or ``multi_sync`` in ``workers`` processes.
+        worlds: of one environment.
+        physics_threads: of one environment.
         workers: processes, each with an environment of its own.
         threads: torch threads while collecting; physics has threads of its own.
         update_threads: torch threads while the networks are updated.
     """
 
     kind: str
+    worlds: int
+    physics_threads: int
     workers: int
     threads: int
     update_threads: int
@@ -38,7 +43,7 @@ class CollectorSettings:
         settings = from_mapping(cls, values, source)
         if settings.kind not in ("sync", "multi_sync"):
             raise InputError(source, "kind", f"must be sync or multi_sync, not {settings.kind!r}")
-        for name in ("workers", "threads", "update_threads"):
+        for name in ("worlds", "physics_threads", "workers", "threads", "update_threads"):
             if getattr(settings, name) < 1:
                 raise InputError(source, name, f"must be at least 1, not {getattr(settings, name)}")
         return settings
@@ -46,17 +51,19 @@ class CollectorSettings:
 
 def build_collector(
     settings: CollectorSettings,
-    make_env: Callable[[], EnvBase],
+    make_env: Callable[[int], EnvBase],
     policy: TensorDictModuleBase,
     steps_per_iteration: int,
 ) -> Collector:
     """A TorchRL collector that never ends; one iteration gives ``steps_per_iteration`` control steps over all worlds.
 
+    ``make_env`` gets the worker's number, to seed by.
+
     ``track_traj_ids=False`` and ``device=None`` because they are the quickest (docs/performance.md).
     """
     if settings.kind == "sync":
         return Collector(
-            make_env(),
+            make_env(0),
             policy,
             frames_per_batch=steps_per_iteration,
             total_frames=-1,
@@ -64,7 +71,7 @@ def build_collector(
             auto_register_policy_transforms=False,
         )
     return Collector(
-        [make_env] * settings.workers,
+        [partial(make_env, worker) for worker in range(settings.workers)],
         policy,
         backend="process",
         num_collectors=settings.workers,

@@ -12,6 +12,7 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
+import torch
 from tensordict import TensorDictBase
 from torchrl.checkpoint import GlobalRNGState
 
@@ -188,16 +189,7 @@ def train(run: Run, loggers: Sequence[Scalars], evaluate: Evaluation | None = No
             while (reason := _end(settings, counters, time.monotonic() - begin + slowest, stop)) is None:
                 started = time.monotonic()
                 figures = iterate(run, batches)
-                if (
-                    evaluate is not None
-                    and settings.evaluate_every
-                    and counters.iteration % settings.evaluate_every == 0
-                ):
-                    result = dict(evaluate(counters.iteration))
-                    counters.score = result.get("score", counters.score)
-                    figures |= {f"evaluation/{name}": value for name, value in result.items()}
-                elif evaluate is None or not settings.evaluate_every:
-                    counters.score = figures.get("episode_length", counters.score)
+                figures |= _judge(run, figures, evaluate)
                 for logger in loggers:
                     logger.write(counters.frames, figures)
                 progress.update(counters.iteration, figures)
@@ -211,6 +203,21 @@ def train(run: Run, loggers: Sequence[Scalars], evaluate: Evaluation | None = No
             for logger in loggers:
                 logger.close()
     return Outcome(reason, counters.iteration, counters.frames, saved or run.save())
+
+
+def _judge(run: Run, figures: Mapping[str, float], evaluate: Evaluation | None) -> dict[str, float]:
+    """Evaluate where it is due; keeps the score of the last evaluation, or of training where there is none."""
+    counters, every = run.counters, run.settings.evaluate_every
+    if evaluate is None or every == 0:
+        counters.score = figures.get("episode_length", counters.score)
+        return {}
+    if counters.iteration % every != 0:
+        return {}
+    # An evaluation draws (and TorchRL seeds) random numbers; training's own must not notice.
+    with torch.random.fork_rng(devices=[]):
+        result = dict(evaluate(counters.iteration))
+    counters.score = result.get("score", counters.score)
+    return {f"evaluation/{name}": value for name, value in result.items()}
 
 
 def iterate(run: Run, batches: Iterator[TensorDictBase]) -> dict[str, float]:
