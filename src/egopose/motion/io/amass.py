@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 
 from egopose.errors import InputError
 from egopose.motion import rotations as rot
+from egopose.motion.io._files import excerpt
 from egopose.motion.io._npz import read_arrays
 from egopose.motion.io.frames import euler_angles
 from egopose.motion.motion import Motion
@@ -109,7 +110,7 @@ def _rate(path: Path, arrays: dict[str, np.ndarray]) -> float:
         if name in arrays:
             value = arrays[name]
             if value.size != 1 or value.dtype.kind not in "fiu" or not 0.1 <= float(value.reshape(())) <= 1e5:
-                raise InputError(path, name, f"{str(value)[:40]} is not a frame rate")
+                raise InputError(path, name, f"{excerpt(str(value.tolist()))} is not a frame rate")
             return float(value.reshape(()))
     raise InputError(path, _RATES[0], "missing: the frame rate is not said")
 

@@ -108,15 +108,15 @@ def _local_poses(raw: BvhFile) -> list[_LocalPose]:
 
 
 def _fold_static_roots(joints: list[BvhJoint], poses: list[_LocalPose]) -> int:
-    """How many joints at the top never move and only carry one driven joint: that one is the body's root."""
+    """How many joints at the top stay at the world's origin and only carry one driven joint: that one is the root."""
     count = 0
     while (
         count + 1 < len(joints)
         and sum(j.parent == count for j in joints) == 1
         and not joints[count].tips
         and poses[count + 1].driven
-        and np.ptp(poses[count].translation, axis=0).max() < 1e-6
-        and (not poses[count].axes or np.ptp(poses[count].angles, axis=0).max() < 1e-6)
+        and not np.abs(poses[count].translation).max(initial=0.0) > 1e-6
+        and not np.abs(poses[count].angles).max(initial=0.0) > 1e-6
     ):
         count += 1
     return count

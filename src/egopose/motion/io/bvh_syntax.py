@@ -201,7 +201,7 @@ def _parse_motion(path: Path, text: str, start: int, n_channels: int) -> tuple[f
     frames = int(value)
     room = len(text) - position
     if frames * n_channels * 2 > room + 2:  # a number and the blank after it take two bytes at least
-        cause = f"{frames} frames of {n_channels} numbers announced, only {max(room, 0)} bytes follow"
+        cause = f"{frames} frames of {n_channels} numbers announced, only {max(room, 0)} bytes follow: cut short"
         raise InputError(path, f"line {where}", cause)
     value, where = fields["frame time"]
     try:

@@ -124,6 +124,8 @@ def _parse(path: Path) -> tuple[str, Array]:
         content = json.loads(read_text(path))
     except json.JSONDecodeError as error:
         raise InputError(path, f"line {error.lineno}", f"not JSON: {error.msg}") from error
+    except ValueError as error:  # a whole number of thousands of digits
+        raise InputError(path, "Frames", f"not JSON: {error}"[:120]) from error
     except RecursionError:
         raise InputError(path, "Frames", "brackets nested too deeply") from None
     frames = content.get("Frames") if isinstance(content, dict) else None
