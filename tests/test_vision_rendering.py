@@ -119,7 +119,7 @@ def test_shake_has_the_size_and_the_mounting_it_is_drawn_with() -> None:
     assert steps == pytest.approx(np.exp(-1 / 3), abs=0.03)
 
 
-@pytest.mark.parametrize("preset", ["ultrafast", "fast"])
+@pytest.mark.parametrize("preset", ["ultrafast", "fast", "medium"])
 def test_flow_of_a_turning_head_is_the_turn(config: RenderConfig, tmp_path: Path, preset: str) -> None:
     """Turning left by w a frame moves the middle of the picture right by tan(w) / (2 tan(fov / 2)) of its width."""
     rate = np.deg2rad(2.0)
@@ -210,6 +210,13 @@ def test_takes_resume_and_follow_their_settings(config: RenderConfig, tmp_path: 
     assert len(list(read_frames(jobs[2].path))) == 7
     with pytest.raises(InputError, match="same video"):
         render_takes([jobs[0], jobs[0]], config, workers=1)
+
+
+def test_a_worker_process_hands_its_error_over(config: RenderConfig, tmp_path: Path) -> None:
+    (tmp_path / "taken").write_text("a file where the folder should be")
+    jobs = [RenderJob(f"t{i}", WEARER, standing(2), tmp_path / "taken" / f"{i}.mp4", "train") for i in range(2)]
+    with pytest.raises(InputError, match=r"taken.*folder: cannot be made"):
+        render_takes(jobs, config, workers=2, progress=False)
 
 
 def test_side_view_follows_each_motion(config: RenderConfig) -> None:

@@ -99,7 +99,9 @@ def render_take(job: RenderJob, config: RenderConfig) -> int:
     """Render one take and write beside the MP4 what it shows; returns the number of frames."""
     seed = room_seed(job.name, job.split, config.room)
     take_seed = int.from_bytes(hashlib.sha256(job.name.encode()).digest()[:4], "big")
-    _record(job.path).unlink(missing_ok=True)
+    if _record(job.path).exists():
+        # Until the new video is there the old record must not vouch for the old one.
+        _record(job.path).unlink()
     render_wearer_video(
         job.model_xml,
         job.qpos,

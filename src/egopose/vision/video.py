@@ -69,7 +69,10 @@ class VideoWriter:
         self.frames += 1
 
     def _open(self, width: int, height: int) -> None:
-        self.path.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise InputError(self.path, "folder", f"cannot be made: {error.strerror}") from error
         fourcc = cv2.VideoWriter.fourcc(*"mp4v")
         self._writer = cv2.VideoWriter(str(self._partial), cv2.CAP_FFMPEG, fourcc, self.fps, (width, height))
         if not self._writer.isOpened():
