@@ -17,3 +17,7 @@ class InputError(ValueError):
     def __init__(self, source: str | PathLike[str], field: str, cause: str) -> None:
         self.source, self.field, self.cause = str(source), field, cause
         super().__init__(f"{self.source}: {field}: {cause}")
+
+    def __reduce__(self) -> tuple[type[InputError], tuple[str, str, str]]:
+        # BaseException would rebuild it from its message alone, and a worker process could not hand it to its parent.
+        return type(self), (self.source, self.field, self.cause)
