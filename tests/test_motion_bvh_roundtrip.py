@@ -114,6 +114,7 @@ def test_six_channels_fold_or_slide(tmp_path: Path) -> None:
         row = "0 0 0 0 0 0  0 90 0 0 0 0  0 {} 0 10 20 30\n"
         return (
             f"HIERARCHY\nROOT Static\n{{\nOFFSET 0 0 0\n{channels}\nJOINT Hips\n{{\nOFFSET 0 90 0\n{channels}\n"
+            f"End Site\n{{\nOFFSET 0 0 10\n}}\n"
             f"JOINT Head\n{{\nOFFSET 0 50 0\n{channels}\nEnd Site\n{{\nOFFSET 0 0 0\n}}\n}}\n}}\n}}\n"
             f"MOTION\nFrames: 2\nFrame Time: 0.04\n{row.format(60)}{row.format(second)}"
         )
@@ -132,3 +133,21 @@ def test_six_channels_fold_or_slide(tmp_path: Path) -> None:
     np.testing.assert_allclose(motion.qpos[:, 8], [0.10, 0.15], atol=1e-9)
     positions, _ = motion.forward_kinematics()
     np.testing.assert_allclose(positions[:, 1, 2], [1.5, 1.55], atol=1e-9)
+
+
+def test_a_root_the_body_moves_against_is_folded(tmp_path: Path) -> None:
+    channels = "CHANNELS 6 Xposition Yposition Zposition Zrotation Xrotation Yrotation"
+    path = tmp_path / "m.bvh"
+    path.write_text(
+        f"HIERARCHY\nROOT World\n{{\nOFFSET 0 0 0\n{channels}\nJOINT Hips\n{{\nOFFSET 0 90 0\n{channels}\n"
+        "JOINT Head\n{\nOFFSET 0 60 0\nCHANNELS 3 Zrotation Xrotation Yrotation\n}\n}\n}\n"
+        "MOTION\nFrames: 2\nFrame Time: 0.04\n"
+        "100 0 0 90 0 0  0 90 0 0 0 0  0 0 0\n200 0 0 90 0 0  0 95 0 -90 0 0  0 0 0\n"
+    )
+    motion = read_motion(path, unit="cm", up="z")
+    assert motion.skeleton.names == ("Hips", "Head")
+    assert motion.skeleton.n_dofs == 3
+    positions, _ = motion.forward_kinematics()
+    # The root is turned a quarter about z: its y is the world's -x.
+    np.testing.assert_allclose(positions[:, 0], [[0.1, 0, 0], [1.05, 0, 0]], atol=1e-12)
+    np.testing.assert_allclose(positions[:, 1], [[-0.5, 0, 0], [1.05, 0.6, 0]], atol=1e-12)

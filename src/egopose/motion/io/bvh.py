@@ -38,7 +38,7 @@ def read_bvh(path: str | Path, *, unit: str | float = "auto", up: str = "auto") 
 
     Returns:
         z up, metres. The up axis turns the root only. ``meta`` records format, source, unit, up axis, stature and the
-        names of static roots folded into the first moving joint (``folded_roots``).
+        names of roots above the body that were folded into its first joint (``folded_roots``).
 
     Raises:
         InputError: names the file, line and cause; also when no unit makes the body a person's size.
@@ -48,7 +48,7 @@ def read_bvh(path: str | Path, *, unit: str | float = "auto", up: str = "auto") 
         raise InputError(path, "option up", f"{up!r} is none of auto, {', '.join(UP_AXES)}")
     raw = parse_bvh(path)
     poses = _local_poses(raw)
-    folded = _fold_static_roots(raw.joints, poses)
+    folded = _fold_carriers(raw.joints, poses)
 
     sample = np.unique(np.linspace(0, len(raw.values) - 1, _GUESS_FRAMES).astype(int))
     skeleton, qpos = _assemble(raw.joints, [p.at(sample) for p in poses], folded, 1.0, up_rotation("z"), still=-1.0)
@@ -107,19 +107,31 @@ def _local_poses(raw: BvhFile) -> list[_LocalPose]:
     return poses
 
 
-def _fold_static_roots(joints: list[BvhJoint], poses: list[_LocalPose]) -> int:
-    """How many joints at the top stay at the world's origin and only carry one driven joint: that one is the root."""
+def _fold_carriers(joints: list[BvhJoint], poses: list[_LocalPose]) -> int:
+    """How many joints at the top are no part of the body.
+
+    Such a one carries a single child, driven by position channels, and either stays at the world's origin or sees the
+    child move freely against it, as no bone does. Leaving it out is exact for all others.
+    """
     count = 0
     while (
         count + 1 < len(joints)
         and sum(j.parent == count for j in joints) == 1
         and not joints[count].tips
         and poses[count + 1].driven
-        and not np.abs(poses[count].translation).max(initial=0.0) > 1e-6
-        and not np.abs(poses[count].angles).max(initial=0.0) > 1e-6
+        and (_is_still(poses[count]) or _moves_freely(poses[count + 1]))
     ):
         count += 1
     return count
+
+
+def _is_still(pose: _LocalPose) -> bool:
+    return bool(np.abs(pose.translation).max() <= 1e-6 and np.abs(pose.angles).max(initial=0.0) <= 1e-6)
+
+
+def _moves_freely(pose: _LocalPose) -> bool:
+    """By more than a hundredth of the distance to its parent."""
+    return bool(np.ptp(pose.translation, axis=0).max() > 0.01 * np.linalg.norm(pose.translation.mean(axis=0)))
 
 
 def _assemble(
