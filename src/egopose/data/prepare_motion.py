@@ -1,0 +1,111 @@
+"""From any motion to a reference clip: on the humanoid's skeleton, at the control rate, settled on the floor."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from scipy.signal import butter, sosfiltfilt
+
+from egopose.humanoid.model import HumanoidModel
+from egopose.motion import rotations as rot
+from egopose.motion.motion import Motion
+from egopose.motion.plant import plant_feet
+from egopose.motion.retarget import RetargetReport, retarget
+from egopose.motion.rotations import Array
+from egopose.motion.settle import SettleSettings, settle
+
+
+@dataclass(frozen=True)
+class PreparationSettings:
+    """See ``conf/data``.
+
+    Args:
+        cutoff_hz: of the zero-lag low-pass over the retargeted motion; None for none.
+        settle: see :class:`egopose.motion.settle.SettleSettings`.
+    """
+
+    cutoff_hz: float | None = 8.0
+    settle: SettleSettings = field(default_factory=SettleSettings)
+
+    @classmethod
+    def from_mapping(cls, values: Mapping[str, Any]) -> PreparationSettings:
+        """From a resolved config group ``{cutoff_hz, settle: {...}}``."""
+        return cls(values.get("cutoff_hz", 8.0), SettleSettings(**dict(values.get("settle", {}))))
+
+
+def low_pass(motion: Motion, cutoff_hz: float) -> Motion:
+    """The motion without what is faster than ``cutoff_hz``: a second-order Butterworth filter, forward and back.
+
+    Marker jitter turns into accelerations no muscle makes; gait analysis filters at 6 Hz (Winter 2009).
+    """
+    if len(motion) < 8 or cutoff_hz >= motion.fps / 2:
+        return motion
+    sections = butter(2, cutoff_hz, fs=motion.fps, output="sos")
+    qpos = motion.qpos.copy()
+    qpos[:, 3:7] = rot.continuous(qpos[:, 3:7])
+    qpos = sosfiltfilt(sections, qpos, axis=0, padtype="odd", padlen=min(12, len(qpos) - 1))
+    qpos[:, 3:7] = rot.normalize(qpos[:, 3:7])
+    return replace(motion, qpos=qpos)
+
+
+def sole_positions(humanoid: HumanoidModel, motion: Motion) -> Array:
+    """``[T, feet * 2, 3]`` world positions of heel and ball of every foot, m (order: right heel, right ball, left ...)."""
+    positions, quats = motion.forward_kinematics()
+    points = [
+        positions[:, foot] + rot.rotate(quats[:, foot], point[None])
+        for foot, sole in zip(humanoid.feet, humanoid.sole_points, strict=True)
+        for point in sole
+    ]
+    return np.stack(points, axis=1)
+
+
+def sole_names(humanoid: HumanoidModel) -> tuple[str, ...]:
+    """Names of the points of :func:`sole_positions`."""
+    return tuple(f"{humanoid.skeleton.names[f]}_{end}" for f in humanoid.feet for end in ("heel", "ball"))
+
+
+def reference_motion(
+    motion: Motion,
+    humanoid: HumanoidModel,
+    settings: PreparationSettings | None = None,
+    overrides: dict[str, str] | None = None,
+) -> tuple[Motion, RetargetReport]:
+    """Retarget, resample to the control rate and settle.
+
+    Args:
+        motion: of any humanoid skeleton, z up.
+        humanoid: whose skeleton and joint limits are used.
+        settings: of filter and settling.
+        overrides: part -> source joint, see :func:`egopose.motion.mapping.identify`.
+
+    Returns:
+        The reference clip with contacts of the four sole points, and the retargeting report.
+
+    Raises:
+        InputError: the skeleton is not recognised as a humanoid.
+    """
+    settings = settings or PreparationSettings()
+    fps = 1.0 / humanoid.control_dt
+    # Twice the control rate keeps what inverse kinematics needs to tell neighbours apart, at a fraction of 120 fps.
+    source = motion.resample(2 * fps) if motion.fps > 2 * fps else motion
+    retargeted, report = retarget(source, humanoid.skeleton, humanoid.joint_range, overrides)
+    if settings.cutoff_hz is not None:
+        retargeted = low_pass(retargeted, settings.cutoff_hz)
+    clip = retargeted.resample(fps)
+    clip = replace(clip, contact_names=sole_names(humanoid), contacts=None)
+    clip, shift = settle(clip, sole_positions(humanoid, clip), settings.settle)
+    clip = plant_feet(
+        clip,
+        np.repeat(humanoid.feet, humanoid.sole_points.shape[1]),
+        humanoid.sole_points.reshape(-1, 3),
+        sole_positions(humanoid, clip),
+        humanoid.joint_range,
+        settings.settle.depth,
+    )
+    centred = clip.qpos.copy()
+    centred[:, :2] -= centred[:1, :2]
+    clip = replace(clip, qpos=centred)
+    return clip, replace(report, ground_shift_m=(float(shift.mean()), float(shift.min()), float(shift.max())))
