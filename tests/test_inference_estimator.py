@@ -13,7 +13,7 @@ from egopose.envs.mdp.observations import humanoid_state
 from egopose.envs.transforms import StateNormalizer
 from egopose.evaluation.survival import action_towards, base_tracking, frames_survived, reference_tracking
 from egopose.inference.estimator import Estimate, estimate_takes
-from egopose.inference.failsafe import FailSafe
+from egopose.inference.failsafe import FailSafe, FailSafeSettings
 
 NEVER_FALL = {"termination": {"enabled": False, "head_drop": 0.1}}
 
@@ -36,7 +36,7 @@ def run(
 ) -> tuple[list[Estimate], torch.Tensor]:
     base = env.base_env
     states = humanoid_state(base.problem.reference_at(torch.arange(base.problem.n_frames))).float() + offset
-    guard = FailSafe(len(PIECES), mode, kappa=0.6, fallen_height=0.3)
+    guard = FailSafe(len(PIECES), FailSafeSettings(mode, kappa=0.6, fallen_height=0.3))
     return estimate_takes(env, actor, critic, states, guard), states
 
 

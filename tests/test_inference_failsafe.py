@@ -5,14 +5,20 @@ from __future__ import annotations
 import pytest
 import torch
 
-from egopose.inference.failsafe import FailSafe
+from egopose.errors import InputError
+from egopose.inference.failsafe import FailSafe, FailSafeSettings
+
+
+def guarding(worlds: int, mode: str) -> FailSafe:
+    return FailSafe(worlds, FailSafeSettings(mode, kappa=0.6, fallen_height=0.3))
+
 
 ACTIVE = torch.ones(2, dtype=torch.bool)
 STANDING = torch.tensor([1.6, 1.6])
 
 
 def test_value_mode_triggers_under_kappa_times_the_mean() -> None:
-    guard = FailSafe(2, "value", kappa=0.6, fallen_height=0.3)
+    guard = guarding(2, "value")
     for _ in range(9):
         assert not guard.update(torch.tensor([10.0, 10.0]), STANDING, ACTIVE).any()
     # With this frame the means are 9.59 and 9.53: the bars stand at 5.754 and 5.718.
@@ -21,20 +27,20 @@ def test_value_mode_triggers_under_kappa_times_the_mean() -> None:
 
 
 def test_naive_mode_looks_at_the_head_alone() -> None:
-    guard = FailSafe(2, "naive", kappa=0.6, fallen_height=0.3)
+    guard = guarding(2, "naive")
     guard.update(torch.tensor([10.0, 10.0]), STANDING, ACTIVE)
     assert guard.update(torch.tensor([0.1, 10.0]), torch.tensor([1.6, 0.29]), ACTIVE).tolist() == [False, True]
 
 
 def test_off_never_triggers_but_keeps_the_record() -> None:
-    guard = FailSafe(2, "off", kappa=0.6, fallen_height=0.3)
+    guard = guarding(2, "off")
     guard.update(torch.tensor([10.0, 10.0]), STANDING, ACTIVE)
     assert not guard.update(torch.tensor([0.0, 0.0]), torch.tensor([0.0, 0.0]), ACTIVE).any()
     assert [c.tolist() for c in guard.confidence] == [[1.0, 1.0], [0.0, 0.0]]
 
 
 def test_worlds_are_apart_and_finished_ones_stay_out() -> None:
-    guard = FailSafe(2, "value", kappa=0.6, fallen_height=0.3)
+    guard = guarding(2, "value")
     guard.update(torch.tensor([10.0, 1.0]), STANDING, ACTIVE)
     only_first = torch.tensor([True, False])
     assert guard.update(torch.tensor([9.0, -5.0]), STANDING, only_first).tolist() == [False, False]
@@ -43,13 +49,13 @@ def test_worlds_are_apart_and_finished_ones_stay_out() -> None:
 
 
 def test_no_trigger_while_the_mean_says_nothing() -> None:
-    guard = FailSafe(2, "value", kappa=0.6, fallen_height=0.3)
+    guard = guarding(2, "value")
     for value in (-1.0, -5.0, -9.0):
         assert not guard.update(torch.tensor([value, value]), STANDING, ACTIVE).any()
 
 
 def test_a_stretch_rated_low_throughout_lowers_the_bar() -> None:
-    guard = FailSafe(1, "value", kappa=0.6, fallen_height=0.3)
+    guard = guarding(1, "value")
     one = torch.ones(1, dtype=torch.bool)
     for _ in range(20):
         guard.update(torch.tensor([10.0]), STANDING[:1], one)
@@ -59,5 +65,5 @@ def test_a_stretch_rated_low_throughout_lowers_the_bar() -> None:
 
 
 def test_unknown_mode_is_refused() -> None:
-    with pytest.raises(ValueError, match="value, naive, off"):
-        FailSafe(1, "never", kappa=0.6, fallen_height=0.3)
+    with pytest.raises(InputError, match="value, naive, off"):
+        guarding(1, "never")

@@ -137,7 +137,11 @@ class Comparison:
 
 
 def compare(
-    methods: Mapping[str, Sequence[Sequence[TakeScores]]], baseline: str, level: float = 0.95, draws: int = 2000
+    methods: Mapping[str, Sequence[Sequence[TakeScores]]],
+    baseline: str,
+    level: float = 0.95,
+    draws: int = 2000,
+    seed: int = 0,
 ) -> Comparison:
     """Means with intervals over runs and takes, and ratios to the baseline on the same takes.
 
@@ -145,7 +149,7 @@ def compare(
         methods: per method its runs (training seeds), per run its takes; all runs on the same takes in the same order.
         baseline: one of ``methods``; it has one run, or as many as each of the others.
         level: of the intervals.
-        draws: of the bootstrap.
+        draws, seed: of the bootstrap.
 
     Raises:
         ValueError: the baseline is missing or the takes differ.
@@ -162,12 +166,12 @@ def compare(
         for method, runs in methods.items()
     }
     figures = {
-        method: {k: mean_interval(v, level, draws) for k, v in table.items() if np.isfinite(v).any()}
+        method: {k: mean_interval(v, level, draws, seed) for k, v in table.items() if np.isfinite(v).any()}
         for method, table in scores.items()
     }
     ratios = {
         method: {
-            k: ratio_interval(v, scores[baseline][k], level, draws)
+            k: ratio_interval(v, scores[baseline][k], level, draws, seed)
             for k, v in table.items()
             if k in figures[method] and k in figures[baseline] and figures[baseline][k].value > 0
         }

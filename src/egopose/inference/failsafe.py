@@ -6,10 +6,36 @@ Three modes. ``value``: reset when ``V(s_t) < kappa * V_mean``, V_mean the runni
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import torch
 from torch import Tensor
 
+from egopose.errors import InputError
+
 MODES = ("value", "naive", "off")
+
+
+@dataclass(frozen=True)
+class FailSafeSettings:
+    """``failsafe`` of ``conf/evaluate.yaml`` and ``conf/estimate.yaml``.
+
+    Args:
+        mode: one of ``value``, ``naive``, ``off``.
+        kappa: fraction of the mean value under which the state counts as unstable.
+        fallen_height: head height (m) under which the humanoid counts as fallen, for ``naive``.
+
+    Raises:
+        InputError: an unknown mode.
+    """
+
+    mode: str
+    kappa: float
+    fallen_height: float
+
+    def __post_init__(self) -> None:
+        if self.mode not in MODES:
+            raise InputError("failsafe", "mode", f"must be one of {', '.join(MODES)}, not {self.mode!r}")
 
 
 class FailSafe:
@@ -17,22 +43,15 @@ class FailSafe:
 
     Args:
         worlds: N.
-        mode: one of ``value``, ``naive``, ``off``.
-        kappa: fraction of the mean value under which the state counts as unstable.
-        fallen_height: head height (m) under which the humanoid counts as fallen, for ``naive``.
+        settings: see :class:`FailSafeSettings`.
 
     Attributes:
         confidence: list over calls of ``[N]`` float64: V(s_t) over its running mean (1 at the first frame; NaN for
             worlds that were not active).
-
-    Raises:
-        ValueError: an unknown mode.
     """
 
-    def __init__(self, worlds: int, mode: str, kappa: float, fallen_height: float) -> None:
-        if mode not in MODES:
-            raise ValueError(f"fail-safe mode {mode!r}; choose from {', '.join(MODES)}")
-        self.mode, self.kappa, self.fallen_height = mode, kappa, fallen_height
+    def __init__(self, worlds: int, settings: FailSafeSettings) -> None:
+        self.settings = settings
         self.confidence: list[Tensor] = []
         self._sum = torch.zeros(worlds, dtype=torch.float64)
         self._count = torch.zeros(worlds, dtype=torch.float64)
@@ -61,8 +80,8 @@ class FailSafe:
         return active & self._unstable(ratio, head_height)
 
     def _unstable(self, ratio: Tensor, head_height: Tensor) -> Tensor:
-        if self.mode == "value":
-            return ratio < self.kappa
-        if self.mode == "naive":
-            return head_height < self.fallen_height
+        if self.settings.mode == "value":
+            return ratio < self.settings.kappa
+        if self.settings.mode == "naive":
+            return head_height < self.settings.fallen_height
         return torch.zeros_like(ratio, dtype=torch.bool)

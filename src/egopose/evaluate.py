@@ -1,0 +1,162 @@
+"""``python -m egopose.evaluate checkpoint=RUN_OR_CHECKPOINT [split=test] [out=DIR]``: score a policy beside PoseReg."""
+
+from __future__ import annotations
+
+from egopose.runtime import prepare_runtime
+
+prepare_runtime()
+
+import sys  # noqa: E402
+from collections.abc import Mapping, Sequence  # noqa: E402
+from dataclasses import dataclass  # noqa: E402
+from pathlib import Path  # noqa: E402
+from typing import TYPE_CHECKING, Any  # noqa: E402
+
+import hydra  # noqa: E402
+from omegaconf import DictConfig  # noqa: E402
+
+from egopose.config import config_dir, from_mapping, resolved  # noqa: E402
+from egopose.errors import InputError  # noqa: E402
+
+if TYPE_CHECKING:
+    from egopose.evaluation.protocols import Comparison
+    from egopose.evaluation.report import TakeVideo
+    from egopose.pipeline import Agent
+
+
+@dataclass(frozen=True)
+class Results:
+    """Where an evaluation was written, and what it found.
+
+    Attributes:
+        folder: of all files, see docs/howto-evaluate.md.
+        comparison: the table.
+        survival: frames survived per run, see :func:`egopose.evaluation.agents.survival_figures`.
+        videos: the side-by-side MP4s.
+    """
+
+    folder: Path
+    comparison: Comparison
+    survival: list[dict[str, dict[str, float]]]
+    videos: list[Path]
+
+
+def run_evaluation(
+    config: Mapping[str, Any],
+    agents: Sequence[Agent],
+    names: Sequence[str],
+    videos: Sequence[TakeVideo | None],
+    out: Path,
+) -> Results:
+    """Score agents (runs of one method with different seeds) and write everything.
+
+    Args:
+        config: resolved ``conf/evaluate.yaml``.
+        agents: see :func:`egopose.pipeline.load_agent`; all on the same takes.
+        names: of all takes of the material.
+        videos: of all takes; None where there is none to show.
+        out: folder of the results.
+
+    Raises:
+        InputError: a setting is missing or unknown, or the split holds no fragments.
+    """
+    import torch
+
+    from egopose.evaluation import report
+    from egopose.evaluation.agents import evaluate_agent, survival_figures
+    from egopose.evaluation.protocols import ContactSettings
+    from egopose.inference.failsafe import FailSafeSettings
+    from egopose.pipeline import build_networks
+
+    source = "conf/evaluate.yaml"
+    failsafe = from_mapping(FailSafeSettings, config["failsafe"], f"{source}: failsafe")
+    contact = from_mapping(ContactSettings, config["contact"], f"{source}: contact")
+    split, threads, material = str(config["split"]), int(config["threads"]), agents[0].material
+    if split not in ("train", "test"):
+        raise InputError(source, "split", f"must be train or test, not {split!r}")
+    fragments = list(material.train if split == "train" else material.test)
+    if not fragments:
+        raise InputError(source, "split", f"the data has no {split} fragments")
+    labels = [f"{names[f.take]}_{f.start}-{f.stop}" for f in fragments]
+
+    runs = [evaluate_agent(agent, fragments, labels, split, failsafe, contact, threads) for agent in agents]
+    interval, survive = config["interval"], config["survival"]
+    comparison = report.compare_runs(runs, float(interval["level"]), int(interval["draws"]), int(interval["seed"]))
+    survival = []
+    for agent in agents:
+        env = agent.make_env(split, worlds=1)
+        torch.manual_seed(int(agent.config["seed"]))
+        start_policy, _ = build_networks(agent.config, agent.material, env)
+        env.close()
+        survival.append(
+            survival_figures(agent, start_policy, split, int(survive["worlds"]), int(survive["seed"]), threads)
+        )
+    about = {
+        "checkpoints": [str(agent.path) for agent in agents],
+        "split": split,
+        "rendered_video": any(v is not None and v.rendered for v in videos),
+        "settings": {key: config[key] for key in ("failsafe", "contact", "interval", "survival")},
+        "survival": survival,
+    }
+    report.write_results(out, comparison, runs, about)
+
+    shown = config["video"]["takes"]
+    written = []
+    for number, (fragment, result) in enumerate(zip(fragments, runs[0], strict=True)):
+        folder = report.write_take(out / "takes", result)
+        video = videos[fragment.take]
+        if video is None or (shown is not None and number >= shown):
+            continue
+        path = folder / "side_by_side.mp4"
+        motions = {"reference": result.reference, "estimate": result.motion}
+        report.write_side_by_side(path, material.humanoid, motions, video, fragment.start, int(config["video"]["size"]))
+        written.append(path)
+    return Results(out, comparison, survival, written)
+
+
+def summary(results: Results) -> str:
+    """What the terminal shows at the end."""
+    from egopose.evaluation import tables
+    from egopose.evaluation.report import HEADLINE
+
+    lines = [tables.as_text(results.comparison, HEADLINE)]
+    for run, figures in enumerate(results.survival):
+        parts = ", ".join(f"{name.replace('_', ' ')} {found['frames']:.1f}" for name, found in figures.items())
+        lines.append(f"frames survived (run {run}): {parts}")
+    lines += [f"video: {path}" for path in results.videos]
+    return "\n".join([*lines, f"all results: {results.folder}"])
+
+
+def output_folder(out: str | None, checkpoint: Path, split: str) -> Path:
+    """Where results go: ``out``, or ``RUN/evaluation/SPLIT``.
+
+    Raises:
+        InputError: ``out`` lies inside the checkpoint, whose files are sealed by checksums.
+    """
+    run = checkpoint.parent.parent if checkpoint.parent.name == "checkpoints" else checkpoint.parent
+    folder = run / "evaluation" / split if out is None else Path(out)
+    if folder.resolve().is_relative_to(checkpoint.resolve()):
+        raise InputError(folder, "out", "lies inside the checkpoint; choose another folder")
+    return folder
+
+
+@hydra.main(version_base="1.3", config_path=str(config_dir()), config_name="evaluate")
+def main(config: DictConfig) -> None:
+    """Hydra's entry."""
+    from egopose.pipeline import load_agent, take_videos
+
+    try:
+        values = resolved(config)
+        given = values["checkpoint"]
+        paths = [str(p) for p in given] if isinstance(given, list) else [str(given)]
+        agents = [load_agent(path, which=str(values["which"])) for path in paths]
+        names, videos = take_videos(agents[0].config)
+        out = output_folder(values["out"], agents[0].path, str(values["split"]))
+        print(summary(run_evaluation(values, agents, names, videos, out)), flush=True)
+    except InputError as error:
+        print(f"error: {error}", file=sys.stderr)
+        raise SystemExit(2) from None
+
+
+if __name__ == "__main__":
+    main()

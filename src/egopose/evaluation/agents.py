@@ -1,0 +1,141 @@
+"""A trained agent on whole fragments: its estimates, PoseReg's, and the figures of both."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import torch
+
+from egopose.envs.starts import FragmentLike
+from egopose.errors import InputError
+from egopose.evaluation.protocols import ContactSettings, TakeScores, score_take
+from egopose.evaluation.survival import base_tracking, frames_survived, reference_tracking
+from egopose.inference.estimator import Controller, Estimate, estimate_takes
+from egopose.inference.failsafe import FailSafe, FailSafeSettings
+from egopose.models.pose_regression import pose_regression
+from egopose.motion import rotations as rot
+from egopose.motion.motion import Motion
+from egopose.motion.rotations import Array
+
+if TYPE_CHECKING:
+    from egopose.pipeline import Agent
+
+SHORTEST = 4  # frames that every metric needs
+
+
+@dataclass(frozen=True)
+class FragmentResult:
+    """One fragment: what was true, what the policy and what PoseReg made of it, and the figures of all three."""
+
+    fragment: FragmentLike
+    reference: Motion
+    estimate: Estimate
+    motion: Motion
+    pose_regression: Motion
+    scores: TakeScores
+    pose_regression_scores: TakeScores
+    reference_scores: TakeScores
+
+
+def evaluate_agent(
+    agent: Agent,
+    fragments: Sequence[FragmentLike],
+    names: Sequence[str],
+    split: str,
+    failsafe: FailSafeSettings,
+    contact: ContactSettings,
+    threads: int,
+) -> list[FragmentResult]:
+    """Estimate every fragment in one pass, all side by side, and score it beside PoseReg.
+
+    Args:
+        agent: see :func:`egopose.pipeline.load_agent`.
+        fragments: those of ``split``, in the material's order.
+        names: one a fragment.
+        split: ``test`` or ``train``.
+        failsafe: when the humanoid restarts.
+        contact: when a sole stands.
+        threads: of the physics.
+
+    Raises:
+        InputError: there are no regressed states, or a fragment is shorter than 4 frames.
+    """
+    material = agent.material
+    if material.states is None:
+        raise InputError(agent.path, "regressor", "the policy starts from the state regressor, and there is none")
+    for fragment, name in zip(fragments, names, strict=True):
+        if fragment.stop - fragment.start < SHORTEST:
+            raise InputError(name, "length", f"{fragment.stop - fragment.start} frames; metrics need {SHORTEST}")
+    worlds = len(fragments)
+    env = agent.make_env(split, worlds=worlds, threads=threads, whole_fragments=True, falls_end=False)
+    guard = FailSafe(worlds, failsafe)
+    estimates = estimate_takes(env, agent.actor, agent.critic, material.states, guard)
+    env.close()
+    return [
+        _result(agent, fragment, name, estimate, contact)
+        for fragment, name, estimate in zip(fragments, names, estimates, strict=True)
+    ]
+
+
+def _result(
+    agent: Agent, fragment: FragmentLike, name: str, estimate: Estimate, contact: ContactSettings
+) -> FragmentResult:
+    humanoid, rows = agent.material.humanoid, slice(estimate.start, estimate.start + len(estimate.qpos))
+    fps = 1.0 / humanoid.control_dt
+    truth: Array = torch.as_tensor(agent.material.reference["qpos"][rows]).double().numpy()
+    assert agent.material.states is not None
+    regressed = pose_regression(
+        agent.material.states[rows].numpy(),
+        humanoid.skeleton,
+        truth[0, :2],
+        rot.heading(truth[0, 3:7]),
+        fps,
+        humanoid.joint_range,
+        name,
+    )
+    return FragmentResult(
+        fragment,
+        Motion(humanoid.skeleton, truth, fps, name),
+        estimate,
+        estimate.motion(humanoid, name),
+        regressed,
+        score_take(name, estimate.qpos, truth, humanoid, contact, estimate.n_resets),
+        score_take(name, regressed.qpos, truth, humanoid, contact),
+        score_take(name, truth, truth, humanoid, contact),
+    )
+
+
+def survival_figures(
+    agent: Agent, start_policy: Controller, split: str, worlds: int, seed: int, threads: int
+) -> dict[str, dict[str, float]]:
+    """Frames until a fall of the policy and of what it must beat, all from the same starts on the reference.
+
+    ``policy``: the mean action. ``start_policy``: the networks before any training. ``base_tracking``: PD towards what
+    actions are added to, without a policy. ``reference_tracking``: PD towards the true motion's own joint angles.
+
+    Args:
+        agent: see :func:`egopose.pipeline.load_agent`.
+        start_policy: an actor as training found it.
+        split: ``test`` or ``train``.
+        worlds: episodes.
+        seed: of the starts.
+        threads: of the physics.
+
+    Returns:
+        ``{controller: {"frames": mean frames survived, "fell": share of episodes}}``.
+    """
+    env = agent.make_env(split, worlds=worlds, threads=threads)
+    controllers = {
+        "policy": agent.actor,
+        "start_policy": start_policy,
+        "base_tracking": base_tracking(env),
+        "reference_tracking": reference_tracking(env),
+    }
+    out = {}
+    for name, controller in controllers.items():
+        survival = frames_survived(env, controller, seed)
+        out[name] = {"frames": survival.mean, "fell": float(survival.fell.double().mean())}
+    env.close()
+    return out
