@@ -94,15 +94,20 @@ def flow_of_frames(frames: Iterable[Frame], config: FlowConfig) -> Iterator[NDAr
     Reading runs ahead of the flow by a few frames only, so a video of any length takes little memory.
     """
     estimator = FlowEstimator(config)
+
+    def flow(before: Future[NDArray[np.uint8]], after: Future[NDArray[np.uint8]]) -> NDArray[np.float16]:
+        # Both were handed to the pool earlier and threads take jobs in order: this waits, but never for ever.
+        return estimator(before.result(), after.result())
+
     pending: deque[Future[NDArray[np.float16]]] = deque()
     with ThreadPoolExecutor(config.workers) as pool:
-        before: NDArray[np.uint8] | None = None
+        before: Future[NDArray[np.uint8]] | None = None
         for frame in frames:
-            after = grey_square(frame, config.working_size)
+            after = pool.submit(grey_square, frame, config.working_size)
             if before is None:
                 yield np.zeros((2, config.stored_size, config.stored_size), np.float16)
             else:
-                pending.append(pool.submit(estimator, before, after))
+                pending.append(pool.submit(flow, before, after))
             before = after
             if len(pending) > 4 * config.workers:
                 yield pending.popleft().result()

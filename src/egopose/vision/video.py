@@ -86,7 +86,8 @@ class VideoWriter:
         if self._writer is not None:
             self._writer.release()
         if kind is not None:
-            self._partial.unlink(missing_ok=True)
+            if self._writer is not None:
+                self._partial.unlink(missing_ok=True)
             return
         if not self.frames:
             raise InputError(self.path, "video", "no frames were written")
