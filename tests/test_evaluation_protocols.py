@@ -106,7 +106,7 @@ def test_tables_say_the_same_in_every_form(tmp_path) -> None:
 
 def test_frames_csv_ends_with_the_take(tmp_path, humanoid: HumanoidModel) -> None:
     scores = score_take("walk", standing(humanoid), standing(humanoid), humanoid, CONTACT)
-    tables.write_frames_csv(tmp_path / "walk.csv", scores, {"confidence": np.ones(30)})
+    tables.write_columns_csv(tmp_path / "walk.csv", {**scores.frames, "confidence": np.ones(30)})
     with (tmp_path / "walk.csv").open() as stream:
         lines = list(csv.DictReader(stream))
     assert len(lines) == 30

@@ -65,18 +65,16 @@ def write_take(folder: Path, result: FragmentResult) -> Path:
     """``frames.csv``, ``estimate.bvh``, ``estimate.npz`` and ``reference.bvh`` in a folder of the take's name."""
     folder = folder / file_name(result.motion.name)
     folder.mkdir(parents=True, exist_ok=True)
-    estimate = result.estimate
-    extra = {
-        "value": estimate.value,
-        "confidence": estimate.confidence,
-        "reset": estimate.resets.astype(float),
-        "fallen": estimate.fallen.astype(float),
-    }
-    tables.write_frames_csv(folder / "frames.csv", result.scores, extra)
-    write_motion(result.motion, folder / "estimate.bvh")
-    write_motion(result.motion, folder / "estimate.npz")
+    tables.write_columns_csv(folder / "frames.csv", {**result.scores.frames, **result.estimate.columns()})
+    write_motion_files(folder, "estimate", result.motion)
     write_motion(result.reference, folder / "reference.bvh")
     return folder
+
+
+def write_motion_files(folder: Path, name: str, motion: Motion) -> None:
+    """``NAME.bvh`` for other programs, ``NAME.npz`` for this one."""
+    write_motion(motion, folder / f"{name}.bvh")
+    write_motion(motion, folder / f"{name}.npz")
 
 
 def write_side_by_side(

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from egopose.evaluation.protocols import METRICS, Comparison, TakeScores
+from egopose.evaluation.protocols import METRICS, Comparison
 from egopose.evaluation.statistics import Interval
 from egopose.motion.rotations import Array
 
@@ -77,12 +77,11 @@ def write_json(path: Path, values: Mapping[str, Any]) -> None:
     path.write_text(json.dumps(_finite(values), indent=1, allow_nan=False) + "\n")
 
 
-def write_frames_csv(path: Path, scores: TakeScores, extra: Mapping[str, Array]) -> None:
-    """One row a frame of one take: every per-frame metric in SI units, then the columns of ``extra`` (``[T]`` each).
+def write_columns_csv(path: Path, columns: Mapping[str, Array]) -> None:
+    """One row a frame of one take; ``columns`` hold at most one value a frame and end with the take.
 
-    Velocities and accelerations are differences to the frames before: the first rows of those columns are empty.
+    Metrics of velocities and accelerations are differences to the frames before: their first rows are empty.
     """
-    columns = {**scores.frames, **extra}
     length = max(len(v) for v in columns.values())
     padded = {k: [""] * (length - len(v)) + [_cell(x) for x in v] for k, v in columns.items()}
     with path.open("w", newline="") as stream:

@@ -60,6 +60,15 @@ class Estimate:
         """N_reset of the take."""
         return int(self.resets.sum())
 
+    def columns(self) -> dict[str, Array]:
+        """Per-frame figures ``[T]`` by name, for a table."""
+        return {
+            "value": self.value,
+            "confidence": self.confidence,
+            "reset": self.resets.astype(np.float64),
+            "fallen": self.fallen.astype(np.float64),
+        }
+
     def motion(self, humanoid: HumanoidModel, name: str) -> Motion:
         """The estimate as a :class:`Motion` of the humanoid's skeleton."""
         return Motion(

@@ -1,0 +1,151 @@
+"""``python -m egopose.estimate video=x.mp4 checkpoint=RUN_OR_CHECKPOINT [out=DIR]``: motion from a video alone."""
+
+from __future__ import annotations
+
+from egopose.runtime import prepare_runtime
+
+prepare_runtime()
+
+import sys  # noqa: E402
+from collections.abc import Mapping  # noqa: E402
+from pathlib import Path  # noqa: E402
+from typing import TYPE_CHECKING, Any  # noqa: E402
+
+import hydra  # noqa: E402
+from omegaconf import DictConfig  # noqa: E402
+
+from egopose.config import config_dir, from_mapping, resolved  # noqa: E402
+from egopose.errors import InputError  # noqa: E402
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from egopose.humanoid.model import HumanoidModel
+    from egopose.models.regressor import StateRegressor
+    from egopose.motion.motion import Motion
+    from egopose.pipeline import Agent, Material
+
+
+def video_material(
+    humanoid: HumanoidModel, regressor: StateRegressor, flow: np.ndarray, encode_batch: int, name: str
+) -> tuple[Material, Motion]:
+    """What the policy needs of a video: a take whose reference is what the state regressor makes of it by itself.
+
+    There is no mocap. PoseReg's motion, from the origin and heading along x, stands in its place: it gives the policy
+    its start, and no figure is taken from the distance to it.
+
+    Args:
+        humanoid: the run's.
+        regressor: trained, in eval mode.
+        flow: ``[T, 2, S, S]`` of the video at the control rate.
+        encode_batch: frames a forward pass.
+        name: of the take.
+
+    Returns:
+        The material and PoseReg's motion.
+
+    Raises:
+        InputError: fewer than 2 frames.
+    """
+    import numpy as np
+    import torch
+
+    from egopose.data.reference import reference_states
+    from egopose.data.store import Fragment
+    from egopose.envs.problem import TakeTable
+    from egopose.models.pose_regression import pose_regression, split_state
+    from egopose.pipeline import Material
+    from egopose.training.fragments import Span
+    from egopose.training.predictions import predict_span
+
+    frames = len(flow)
+    if frames < 2:
+        raise InputError(name, "video", f"has {frames} frames at 30 frames/s; at least 2 are needed")
+    seen = predict_span(regressor, torch.from_numpy(flow), Span(0, frames), encode_batch)
+    states = seen["humanoid_state"].numpy()
+    facing = np.array([1.0, 0.0, 0.0, 0.0])
+    motion = pose_regression(
+        states, humanoid.skeleton, np.zeros(2), facing, 1.0 / humanoid.control_dt, humanoid.joint_range, name
+    )
+    reference = reference_states(humanoid, motion)
+    lowest = reference["xpos"][:, humanoid.head, 2].min().reshape(1)
+    material = Material(
+        humanoid,
+        reference,
+        TakeTable(torch.tensor([0]), torch.tensor([frames]), lowest),
+        train=[],
+        test=[Fragment(0, 0, frames)],
+        visual_features=seen["visual_features"],
+        visual_context=seen["visual_context"],
+        joint_targets=torch.from_numpy(split_state(states, humanoid.joint_range).joint_angles).float(),
+        states=seen["humanoid_state"],
+    )
+    return material, motion
+
+
+def run_estimate(config: Mapping[str, Any], agent: Agent, pose_motion: Motion, video: Path, out: Path) -> Path:
+    """Drive the humanoid through the video and write what came of it.
+
+    Args:
+        config: resolved ``conf/estimate.yaml``.
+        agent: on :func:`video_material`.
+        pose_motion: PoseReg's motion, for the picture.
+        video: the MP4.
+        out: folder of the results: ``estimate.bvh``, ``estimate.npz``, ``frames.csv``, ``side_by_side.mp4``.
+
+    Returns:
+        The folder.
+
+    Raises:
+        InputError: a setting is missing or wrong.
+        RuntimeError: no OpenGL here.
+    """
+    import torch
+
+    from egopose.evaluation.report import TakeVideo, write_motion_files, write_side_by_side
+    from egopose.evaluation.tables import write_columns_csv
+    from egopose.inference.estimator import estimate_takes
+    from egopose.inference.failsafe import FailSafe, FailSafeSettings
+
+    guard = FailSafe(1, from_mapping(FailSafeSettings, config["failsafe"], "conf/estimate.yaml: failsafe"))
+    torch.set_num_threads(1)
+    env = agent.make_env("test", worlds=1, threads=1, whole_fragments=True, falls_end=False)
+    assert agent.material.states is not None
+    (estimate,) = estimate_takes(env, agent.actor, agent.critic, agent.material.states, guard)
+    env.close()
+    humanoid = agent.material.humanoid
+    motion = estimate.motion(humanoid, pose_motion.name)
+    out.mkdir(parents=True, exist_ok=True)
+    write_motion_files(out, "estimate", motion)
+    write_columns_csv(out / "frames.csv", estimate.columns())
+    motions = {"estimate": motion, "PoseReg": pose_motion}
+    seen = TakeVideo(video, float(config["offset"]), rendered=False)
+    write_side_by_side(out / "side_by_side.mp4", humanoid, motions, seen, 0, int(config["size"]))
+    print(f"{len(motion)} frames, {estimate.n_resets} resets by the fail-safe; written to {out}", flush=True)
+    return out
+
+
+@hydra.main(version_base="1.3", config_path=str(config_dir()), config_name="estimate")
+def main(config: DictConfig) -> None:
+    """Hydra's entry."""
+    from egopose import pipeline
+    from egopose.vision.features import extract_flow
+
+    try:
+        values = resolved(config)
+        video = Path(str(values["video"]))
+        out = video.with_name(f"{video.stem}_estimate") if values["out"] is None else Path(str(values["out"]))
+        run, humanoid, regressor = pipeline.load_regressor_of(str(values["checkpoint"]), which=str(values["which"]))
+        fps = 1.0 / humanoid.control_dt
+        flow = extract_flow(video, run["vision"]["flow"], fps, float(values["offset"]))
+        batch = int(run["vision"]["encode_batch"])
+        material, pose_motion = video_material(humanoid, regressor, flow, batch, video.stem)
+        agent = pipeline.load_agent(str(values["checkpoint"]), material, which=str(values["which"]))
+        run_estimate(values, agent, pose_motion, video, out)
+    except InputError as error:
+        print(f"error: {error}", file=sys.stderr)
+        raise SystemExit(2) from None
+
+
+if __name__ == "__main__":
+    main()
