@@ -36,6 +36,19 @@ class PreparationSettings:
         return cls(values.get("cutoff_hz", 8.0), SettleSettings(**dict(values.get("settle", {}))))
 
 
+def without_lead_in(motion: Motion) -> Motion:
+    """The motion without a first frame that is not of it: many exports begin with a T-pose.
+
+    It is told by its jump: some joint moves further into frame 1 than 0.15 m and five times as far as it usually does.
+    """
+    if len(motion) < 3:
+        return motion
+    positions, _ = motion.forward_kinematics()
+    local = positions - positions[:, :1]
+    jumps = np.linalg.norm(np.diff(local, axis=0), axis=2).max(axis=1)
+    return motion.slice(1, len(motion)) if jumps[0] > max(0.15, 5 * np.median(jumps[1:])) else motion
+
+
 def low_pass(motion: Motion, cutoff_hz: float) -> Motion:
     """The motion without what is faster than ``cutoff_hz``: a second-order Butterworth filter, forward and back.
 
@@ -52,7 +65,7 @@ def low_pass(motion: Motion, cutoff_hz: float) -> Motion:
 
 
 def sole_positions(humanoid: HumanoidModel, motion: Motion) -> Array:
-    """``[T, feet * 2, 3]`` world positions of heel and ball of every foot, m (order: right heel, right ball, left ...)."""
+    """``[T, feet * 2, 3]`` world positions (m) of every foot's heel and ball, in this order."""
     positions, quats = motion.forward_kinematics()
     points = [
         positions[:, foot] + rot.rotate(quats[:, foot], point[None])
@@ -90,6 +103,7 @@ def reference_motion(
     settings = settings or PreparationSettings()
     fps = 1.0 / humanoid.control_dt
     # Twice the control rate keeps what inverse kinematics needs to tell neighbours apart, at a fraction of 120 fps.
+    motion = without_lead_in(motion)
     source = motion.resample(2 * fps) if motion.fps > 2 * fps else motion
     retargeted, report = retarget(source, humanoid.skeleton, humanoid.joint_range, overrides)
     if settings.cutoff_hz is not None:

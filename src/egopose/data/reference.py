@@ -57,8 +57,8 @@ def reference_states(humanoid: HumanoidModel, motion: Motion) -> TensorDict:
 def supported(humanoid: HumanoidModel, states: TensorDict, contacts: np.ndarray, fps: float) -> np.ndarray:
     """Frames ``[T]`` a body on a bare floor could be in: a sole touches it, or the body really falls freely.
 
-    Where the mocap's actor hung from or stood on something the scene does not hold, the centre of mass neither falls nor
-    is held up by a foot on the floor; no control can follow there, so neither training nor the physics gate starts
+    Where the mocap's actor hung from or stood on something the scene does not hold, the centre of mass neither falls
+    nor is held up by a foot on the floor; no control can follow there, so neither training nor the physics gate starts
     there.
 
     Args:

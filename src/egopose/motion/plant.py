@@ -1,7 +1,7 @@
 """Plant the feet: soles that stand on the floor lie flat on it, none is under it.
 
-After :mod:`egopose.motion.settle` a standing foot may still be tilted by the few degrees mocap and retargeting leave, with
-its heel on the floor and its ball a centimetre above. A simulated foot rocks flat at once and the body sinks by it.
+After :mod:`egopose.motion.settle` a standing foot may still be tilted by the few degrees mocap and retargeting leave,
+with its heel on the floor and its ball a centimetre above. A simulated foot rocks flat at once, and the body sinks.
 """
 
 from __future__ import annotations

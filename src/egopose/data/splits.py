@@ -1,0 +1,60 @@
+"""Which frames are trained on and which are held out."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from egopose.data.store import Fragment, TakeInfo
+from egopose.errors import InputError
+
+
+def split_takes(
+    takes: Sequence[TakeInfo], settings: Mapping[str, Any], part: str, supported_only: bool = True
+) -> list[Fragment]:
+    """Fragments of the training or test part.
+
+    Args:
+        takes: of the store.
+        settings: ``conf/data``'s ``split``: ``kind``: ``time`` (each take's first ``train_share`` trains, the rest
+            tests, if it is at least ``shortest`` frames long; else the whole take trains) or ``subject`` (the takes of
+            ``test_subjects`` test, all others train); ``subjects``: the only ones used, or null for all; ``shortest``
+            frames a fragment has.
+        part: ``train`` or ``test``.
+        supported_only: cut fragments where no body on a bare floor could be (see
+            :func:`egopose.data.reference.supported`).
+
+    Raises:
+        InputError: an unknown setting, subject or kind, or nothing is left; names the field.
+    """
+    kind, shortest = settings["kind"], int(settings["shortest"])
+    subjects = settings.get("subjects")
+    known = {t.subject for t in takes}
+    for key in ("subjects", "test_subjects"):
+        if unknown := {str(s) for s in settings.get(key) or ()} - known:
+            raise InputError(
+                "data.split", key, f"no such subjects: {', '.join(sorted(unknown))}; there are {sorted(known)}"
+            )
+    out = []
+    for index, take in enumerate(takes):
+        if subjects is not None and take.subject not in {str(s) for s in subjects}:
+            continue
+        if kind == "time":
+            cut = round(take.length * float(settings["train_share"]))
+            if take.length - cut < shortest:
+                cut = take.length
+            spans = {"train": (0, cut), "test": (cut, take.length)}
+            start, stop = spans[part]
+        elif kind == "subject":
+            tests = take.subject in {str(s) for s in settings["test_subjects"]}
+            start, stop = (0, take.length) if tests == (part == "test") else (0, 0)
+        else:
+            raise InputError("data.split", "kind", f"must be time or subject, not {kind!r}")
+        runs = take.supported if supported_only else ((0, take.length),)
+        pieces = [(max(start, a), min(stop, b)) for a, b in runs]
+        out += [Fragment(index, a, b) for a, b in pieces if b - a >= shortest]
+    if not out:
+        raise InputError(
+            "data.split", part, f"leaves no fragment of {shortest} frames; see data.split in the configuration"
+        )
+    return out

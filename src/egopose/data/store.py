@@ -1,0 +1,247 @@
+"""The memory-mapped store of takes: reference states, flow, features, all with one axis of frames.
+
+A folder::
+
+    store.json            schema, fps, fingerprint of humanoid and preparation, the takes
+    clips/<take>.npz      the reference clips in the project's own format
+    videos/<take>.mp4     the wearer's video (rendered, or a link to the user's own)
+    reference/            TensorDict [F], float64: the body-state keys
+    flow/<name>/          TensorDict [F]: flow [2, S, S] float16; done.json lists the takes that are in
+    tables/<name>/        TensorDicts [F] of trained encoders and regressors, each with its own card.json
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from tensordict import MemoryMappedTensor, TensorDict
+from torch import Tensor
+
+from egopose.errors import InputError
+from egopose.motion.io import read_motion, write_motion
+from egopose.motion.motion import Motion
+
+SCHEMA = 1
+
+
+@dataclass(frozen=True)
+class TakeInfo:
+    """One take's row in ``store.json``.
+
+    Args:
+        name: unique in the store.
+        subject: whose motion it is.
+        offset, length: its frames among the store's.
+        lowest_head_height: m, of the reference.
+        source: file it came from (name only), with licence.
+        video: path of the wearer's video, relative to the store or absolute for a user's own.
+        sync_offset: s; what the motion shows at t, the video shows at t + offset.
+        rendered: whether the video was rendered from the motion.
+        supported: ``[[start, stop], ...]`` frames in which a body on a bare floor could be in.
+        retargeting_mm: mean distance of the retargeted joints to their source, mm.
+    """
+
+    name: str
+    subject: str
+    offset: int
+    length: int
+    lowest_head_height: float
+    source: str
+    video: str
+    sync_offset: float
+    rendered: bool
+    supported: tuple[tuple[int, int], ...]
+    retargeting_mm: float
+
+
+@dataclass(frozen=True)
+class Fragment:
+    """Frames ``start .. stop - 1`` of one take (in the take's own count)."""
+
+    take: int
+    start: int
+    stop: int
+
+
+class TakeStore:
+    """An open store; arrays are memory-mapped and read on use.
+
+    Raises:
+        InputError: not a store, of another schema, or damaged; names the field.
+    """
+
+    def __init__(self, root: Path) -> None:
+        self.root = root
+        path = root / "store.json"
+        if not path.is_file():
+            raise InputError(
+                root, "store.json", "is missing: this is not a take store; make one: python -m egopose.prepare"
+            )
+        try:
+            self.card: dict[str, Any] = json.loads(path.read_text())
+            schema = self.card["schema"]
+            if schema != SCHEMA:
+                raise InputError(path, "schema", f"is {schema}, this version reads {SCHEMA}; prepare the data again")
+            self.takes = tuple(
+                TakeInfo(**{**t, "supported": tuple((int(a), int(b)) for a, b in t["supported"])})
+                for t in self.card["takes"]
+            )
+            self.fps = float(self.card["fps"])
+        except (KeyError, TypeError, ValueError) as error:
+            if isinstance(error, InputError):
+                raise
+            raise InputError(path, "takes", f"cannot be read: {error}") from None
+        self.frames_total = sum(t.length for t in self.takes)
+
+    @classmethod
+    def open(cls, root: str | os.PathLike[str]) -> TakeStore:
+        """Open the store in a folder."""
+        return cls(Path(root))
+
+    @classmethod
+    def create(
+        cls,
+        root: Path,
+        fps: float,
+        fingerprint: str,
+        takes: Sequence[TakeInfo],
+        clips: Sequence[Motion],
+        states: TensorDict,
+    ) -> TakeStore:
+        """Write a new store; it appears whole, by renaming, and replaces nothing that is there.
+
+        Args:
+            root: of the store; must not hold one.
+            fps: of all clips.
+            fingerprint: of all that the reference depends on.
+            takes: rows, offsets in order.
+            clips: reference clips, in step with ``takes``.
+            states: ``[F]`` body states.
+        """
+        part = root.with_name(root.name + ".part")
+        shutil.rmtree(part, ignore_errors=True)
+        (part / "clips").mkdir(parents=True)
+        (part / "videos").mkdir()
+        for take, clip in zip(takes, clips, strict=True):
+            write_motion(clip, part / "clips" / f"{take.name}.motion.npz")
+        states.memmap(part / "reference")
+        card = {"schema": SCHEMA, "fps": fps, "fingerprint": fingerprint, "takes": [asdict(t) for t in takes]}
+        (part / "store.json").write_text(json.dumps(card, indent=1))
+        os.replace(part, root)
+        return cls(root)
+
+    @property
+    def fingerprint(self) -> str:
+        return str(self.card["fingerprint"])
+
+    @property
+    def reference(self) -> TensorDict:
+        """Body states ``[F]`` of all takes, float64, memory-mapped."""
+        states = self._load(self.root / "reference", "reference")
+        if len(states) != self.frames_total:
+            raise InputError(self.root, "reference", f"has {len(states)} frames, the takes {self.frames_total}")
+        return states
+
+    def frames(self, take: int) -> slice:
+        """The take's frames among the store's."""
+        info = self.takes[take]
+        return slice(info.offset, info.offset + info.length)
+
+    def clip(self, take: int) -> Motion:
+        """The reference clip of a take."""
+        return read_motion(self.root / "clips" / f"{self.takes[take].name}.motion.npz")
+
+    def video(self, take: int) -> Path:
+        """Path of the wearer's video."""
+        return self.root / self.takes[take].video
+
+    def flow(self, name: str) -> Tensor:
+        """``[F, 2, S, S]`` float16, memory-mapped.
+
+        Raises:
+            InputError: takes are missing from it.
+        """
+        missing = set(range(len(self.takes))) - self.flow_done(name)
+        if missing:
+            names = ", ".join(self.takes[i].name for i in sorted(missing)[:5])
+            raise InputError(
+                self.root / "flow" / name, "done.json", f"lacks {len(missing)} takes ({names} ...): prepare"
+            )
+        return self._load(self.root / "flow" / name, f"flow/{name}")["flow"]
+
+    def flow_done(self, name: str) -> set[int]:
+        """Takes whose flow is in."""
+        path = self.root / "flow" / name / "done.json"
+        return set(json.loads(path.read_text())) if path.is_file() else set()
+
+    def open_flow(self, name: str, size: int) -> Tensor:
+        """The flow table to be filled; made on first use."""
+        folder = self.root / "flow" / name
+        if not folder.is_dir():
+            part = folder.with_name(name + ".part")
+            shutil.rmtree(part, ignore_errors=True)
+            part.mkdir(parents=True)
+            table = MemoryMappedTensor.zeros(
+                (self.frames_total, 2, size, size), dtype=torch.float16, filename=str(part / "flow.memmap")
+            )
+            TensorDict({"flow": table}, batch_size=[self.frames_total]).memmap_(part)
+            os.replace(part, folder)
+        return self._load(folder, f"flow/{name}")["flow"]
+
+    def mark_flow(self, name: str, take: int) -> None:
+        """Note that a take's flow is in."""
+        path = self.root / "flow" / name / "done.json"
+        part = path.with_suffix(".part")
+        part.write_text(json.dumps(sorted(self.flow_done(name) | {take})))
+        os.replace(part, path)
+
+    def has_table(self, name: str) -> bool:
+        return (self.root / "tables" / name / "card.json").is_file()
+
+    def table(self, name: str) -> TensorDict:
+        """Tensors ``[F, ...]`` of a trained encoder or regressor, memory-mapped."""
+        return self._load(self.root / "tables" / name, f"tables/{name}")
+
+    def table_card(self, name: str) -> dict[str, Any]:
+        """What the table's maker noted about it."""
+        return json.loads((self.root / "tables" / name / "card.json").read_text())
+
+    def write_table(self, name: str, tensors: dict[str, Tensor], card: dict[str, Any]) -> None:
+        """Store a table whole, by renaming; one of the same name is replaced.
+
+        Raises:
+            ValueError: a tensor's first axis is not the store's frames.
+        """
+        for key, tensor in tensors.items():
+            if len(tensor) != self.frames_total:
+                raise ValueError(f"{key} has {len(tensor)} frames, the store {self.frames_total}")
+        folder = self.root / "tables" / name
+        part = folder.with_name(folder.name + ".part")
+        shutil.rmtree(part, ignore_errors=True)
+        part.mkdir(parents=True)
+        TensorDict(dict(tensors), batch_size=[self.frames_total]).memmap(part)
+        (part / "card.json").write_text(json.dumps(card, indent=1))
+        shutil.rmtree(folder, ignore_errors=True)
+        os.replace(part, folder)
+
+    def _load(self, folder: Path, field: str) -> TensorDict:
+        if not folder.is_dir():
+            raise InputError(self.root, field, "is missing: python -m egopose.prepare makes it")
+        try:
+            return TensorDict.load_memmap(folder)
+        except Exception as error:  # tensordict raises whatever the damage happens to be
+            raise InputError(folder, field, f"is damaged: {error}") from None
+
+
+def runs_of(mask: np.ndarray) -> tuple[tuple[int, int], ...]:
+    """``[start, stop)`` of every run of True in a boolean array ``[T]``."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], np.asarray(mask, dtype=np.int8), [0]])))
+    return tuple((int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True))
