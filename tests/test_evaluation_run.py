@@ -29,7 +29,7 @@ FRAMES = 24
 EVALUATE = {
     "split": "test",
     "failsafe": {"mode": "value", "kappa": 0.6, "fallen_height": 0.3},
-    "contact": {"height": 0.05, "speed": 0.5},
+    "contact": {"height": 0.03, "speed": 0.5},
     "interval": {"level": 0.95, "draws": 50, "seed": 0},
     "survival": {"worlds": 3, "seed": 1},
     "video": {"takes": 1, "size": 64},

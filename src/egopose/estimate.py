@@ -21,9 +21,10 @@ if TYPE_CHECKING:
     import numpy as np
 
     from egopose.humanoid.model import HumanoidModel
+    from egopose.material import Material
     from egopose.models.regressor import StateRegressor
     from egopose.motion.motion import Motion
-    from egopose.pipeline import Agent, Material
+    from egopose.pipeline import Agent
 
 
 def video_material(
@@ -53,8 +54,9 @@ def video_material(
     from egopose.data.reference import reference_states
     from egopose.data.store import Fragment
     from egopose.envs.problem import TakeTable
-    from egopose.models.pose_regression import pose_regression, split_state
-    from egopose.pipeline import Material
+    from egopose.material import Material
+    from egopose.models.pose_regression import pose_regression
+    from egopose.regression import joint_targets
     from egopose.training.fragments import Span
     from egopose.training.predictions import predict_span
 
@@ -69,15 +71,16 @@ def video_material(
     )
     reference = reference_states(humanoid, motion)
     lowest = reference["xpos"][:, humanoid.head, 2].min().reshape(1)
+    whole = [Fragment(0, 0, frames)]
     material = Material(
         humanoid,
         reference,
         TakeTable(torch.tensor([0]), torch.tensor([frames]), lowest),
-        train=[],
-        test=[Fragment(0, 0, frames)],
+        train=whole,
+        test=whole,
         visual_features=seen["visual_features"],
         visual_context=seen["visual_context"],
-        joint_targets=torch.from_numpy(split_state(states, humanoid.joint_range).joint_angles).float(),
+        joint_targets=joint_targets(seen["humanoid_state"], humanoid),
         states=seen["humanoid_state"],
     )
     return material, motion
@@ -125,23 +128,44 @@ def run_estimate(config: Mapping[str, Any], agent: Agent, pose_motion: Motion, v
     return out
 
 
+def run_folder(checkpoint: Path) -> Path:
+    """The run directory a checkpoint folder ``RUN/checkpoints/NAME`` lies in."""
+    return checkpoint.resolve().parents[1]
+
+
+def estimate_video(values: Mapping[str, Any]) -> Path:
+    """The whole way of ``conf/estimate.yaml``, resolved: video, flow, regressor, policy, files.
+
+    Returns:
+        The folder of the results.
+
+    Raises:
+        InputError: the video, the run or a setting cannot be used; names it.
+        RuntimeError: no OpenGL here.
+    """
+    from egopose.data.preparation import humanoid_of
+    from egopose.pipeline import load_agent
+    from egopose.regression import load_regressor
+    from egopose.training.checkpoint import find_checkpoint, read_json
+    from egopose.vision.features import extract_flow
+
+    video = Path(str(values["video"]))
+    out = video.with_name(f"{video.stem}_estimate") if values["out"] is None else Path(str(values["out"]))
+    checkpoint = find_checkpoint(str(values["checkpoint"]), str(values["which"]))
+    run = read_json(checkpoint, "config")
+    humanoid = humanoid_of(run)
+    regressor, made_with = load_regressor(run_folder(checkpoint) / "regressor")
+    vision = made_with["vision"]
+    flow = extract_flow(video, vision["flow"], 1.0 / humanoid.control_dt, float(values["offset"]))
+    material, pose_motion = video_material(humanoid, regressor, flow, int(vision["encode_batch"]), video.stem)
+    return run_estimate(values, load_agent(checkpoint, material), pose_motion, video, out)
+
+
 @hydra.main(version_base="1.3", config_path=str(config_dir()), config_name="estimate")
 def main(config: DictConfig) -> None:
     """Hydra's entry."""
-    from egopose import pipeline
-    from egopose.vision.features import extract_flow
-
     try:
-        values = resolved(config)
-        video = Path(str(values["video"]))
-        out = video.with_name(f"{video.stem}_estimate") if values["out"] is None else Path(str(values["out"]))
-        run, humanoid, regressor = pipeline.load_regressor_of(str(values["checkpoint"]), which=str(values["which"]))
-        fps = 1.0 / humanoid.control_dt
-        flow = extract_flow(video, run["vision"]["flow"], fps, float(values["offset"]))
-        batch = int(run["vision"]["encode_batch"])
-        material, pose_motion = video_material(humanoid, regressor, flow, batch, video.stem)
-        agent = pipeline.load_agent(str(values["checkpoint"]), material, which=str(values["which"]))
-        run_estimate(values, agent, pose_motion, video, out)
+        estimate_video(resolved(config))
     except InputError as error:
         print(f"error: {error}", file=sys.stderr)
         raise SystemExit(2) from None
