@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import types
 import typing
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import MISSING, fields
 from datetime import datetime
 from pathlib import Path
 from typing import Any, TypeVar, Union
 
+from hydra import compose, initialize_config_dir
+from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
@@ -100,6 +102,20 @@ def convert(value: Any, kind: Any, source: str, field: str) -> Any:
     if isinstance(value, kind) and not (kind is int and isinstance(value, bool)):
         return value
     raise InputError(source, field, f"must be {kind.__name__}, not {value!r}")
+
+
+def compose_config(name: str, overrides: Sequence[str] = ()) -> dict[str, Any]:
+    """The resolved ``conf/NAME.yaml`` with overrides as on a command line, for use without Hydra's main.
+
+    Raises:
+        InputError: an override names no setting or choice, or a value is missing.
+    """
+    register_resolvers()
+    try:
+        with initialize_config_dir(str(config_dir()), version_base="1.3"):
+            return resolved(compose(name, list(overrides)))
+    except HydraException as error:
+        raise InputError(f"conf/{name}.yaml", "override", str(error).splitlines()[0]) from None
 
 
 def register_resolvers() -> None:

@@ -78,7 +78,6 @@ def build_collector(
         sync=True,
         frames_per_batch=steps_per_iteration,
         total_frames=-1,
-        track_traj_ids=False,
         cat_results=0,
         auto_register_policy_transforms=False,
     )

@@ -1,0 +1,259 @@
+"""From the resolved configuration to the objects it names; the one place where the rooms meet.
+
+The way of training: store of takes -> state regressor's tables -> environment -> networks -> PPO.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import torch
+from tensordict.nn import TensorDictModuleBase
+from torchrl.envs import Compose, EnvBase, TransformedEnv
+
+from egopose.config import compose_config
+from egopose.data.preparation import store_folder
+from egopose.data.store import TakeStore
+from egopose.envs import build as envs
+from egopose.envs.transforms import StateNormalizer, VisualContext
+from egopose.errors import InputError
+from egopose.evaluation.report import TakeVideo
+from egopose.evaluation.survival import frames_survived
+from egopose.material import Material, load_material, motion_material
+from egopose.models.policy import PolicySettings, build_actor, build_critic
+from egopose.training.checkpoint import RunCheckpoint, find_checkpoint, read_json, require, verify
+from egopose.training.collectors import CollectorSettings, build_collector, transform_state
+from egopose.training.loop import Evaluation, LoopSettings, Run
+from egopose.training.ppo import PPO, PPOSettings
+
+__all__ = [
+    "Agent",
+    "build_env",
+    "build_evaluation",
+    "build_networks",
+    "build_run",
+    "compose_config",
+    "load_agent",
+    "load_material",
+    "motion_material",
+    "take_videos",
+]
+
+_LOOP_IN_ALGO = ("iterations", "steps_per_iteration")
+_LOOP_IN_TRAINING = ("total_steps", "max_seconds", "checkpoint_every", "keep_last", "evaluate_every")
+
+
+def build_env(
+    config: Mapping[str, Any],
+    material: Material,
+    split: str = "train",
+    *,
+    worlds: int,
+    threads: int = 1,
+    seed: int = 0,
+    whole_fragments: bool = False,
+    falls_end: bool | None = None,
+    dump_dir: Path | None = None,
+) -> TransformedEnv:
+    """The environment with its transforms, as ``config`` says.
+
+    Args:
+        config: resolved.
+        material: see :class:`Material`.
+        split: ``train`` or ``test`` fragments.
+        worlds: N.
+        threads: of the physics.
+        seed: of the starts.
+        whole_fragments: each world runs its own fragment from end to end.
+        falls_end: whether a fall ends an episode; None for what the task says.
+        dump_dir: where diverged worlds leave their last states.
+
+    Raises:
+        InputError: the configuration asks for a table the material lacks, or the rooms refuse it.
+    """
+    task = dict(config["task"])
+    if falls_end is not None:
+        task["termination"] = {**task["termination"], "enabled": falls_end}
+    try:
+        problem = envs.build_problem(
+            material.humanoid,
+            material.reference,
+            material.takes,
+            task,
+            config["reward"],
+            action_reference=material.joint_targets,
+        )
+        base = envs.build_env(
+            problem,
+            material.train if split == "train" else material.test,
+            worlds,
+            task,
+            threads=threads,
+            seed=seed,
+            whole_fragments=whole_fragments,
+            dump_dir=dump_dir,
+        )
+    except (ValueError, TypeError) as error:
+        raise error if isinstance(error, InputError) else InputError("configuration", "task", str(error)) from None
+    transforms = [StateNormalizer(base.observation_spec["humanoid_state"].shape[-1])]
+    if config["model"]["context"]["source"] == "frozen":
+        if material.visual_context is None:
+            raise InputError("configuration", "model.context.source", "frozen needs a trained state regressor")
+        transforms.insert(0, VisualContext(material.visual_context))
+    return TransformedEnv(base, Compose(*transforms))
+
+
+def build_networks(
+    config: Mapping[str, Any], material: Material, env: EnvBase
+) -> tuple[TensorDictModuleBase, TensorDictModuleBase]:
+    """Actor and critic for ``env``'s observations, their start drawn from torch's generator.
+
+    Raises:
+        InputError: ``config["model"]`` does not fit; names the setting.
+    """
+    settings = PolicySettings.from_config(config["model"])
+    widths = {name: spec.shape[-1] for name, spec in env.observation_spec.items() if name != "reward_terms"}
+    bounds = torch.stack([material.takes.offsets, material.takes.offsets + material.takes.lengths], dim=1)
+    actor = build_actor(settings, widths, env.action_spec.shape[-1], material.visual_features, bounds)
+    return actor, build_critic(settings, widths, material.visual_features, bounds)
+
+
+def build_run(config: Mapping[str, Any], folder: Path, material: Material) -> Run:
+    """The run ``config`` describes, not yet begun.
+
+    Raises:
+        InputError: a setting is missing, unknown or out of range.
+    """
+    algo, training = dict(config["algo"]), config["training"]
+    loop = {name: algo.pop(name, ...) for name in _LOOP_IN_ALGO}
+    loop |= {name: training.get(name, ...) for name in _LOOP_IN_TRAINING}
+    settings = LoopSettings.from_config(loop)
+    material.keep_regressor(folder)
+    collector_settings = CollectorSettings.from_config(config["collector"])
+    ppo_settings = PPOSettings.from_config(algo)
+
+    torch.manual_seed(int(config["seed"]))
+    probe = build_env(config, material, worlds=1)
+    actor, critic = build_networks(config, material, probe)
+    action_size = int(probe.action_spec.shape[-1])
+    probe.close()
+    collector = build_collector(
+        collector_settings,
+        partial(_training_env, config, material, collector_settings, folder),
+        actor,
+        settings.steps_per_iteration,
+    )
+    ppo = PPO(actor, critic, ppo_settings)
+    return Run(ppo, collector, settings, collector_settings, folder, config, action_size)
+
+
+def _training_env(
+    config: Mapping[str, Any], material: Material, settings: CollectorSettings, folder: Path, worker: int
+) -> TransformedEnv:
+    return build_env(
+        config,
+        material,
+        worlds=settings.worlds,
+        threads=settings.physics_threads,
+        seed=int(config["seed"]) * 1000 + worker,
+        dump_dir=folder / "diverged",
+    )
+
+
+def build_evaluation(run: Run, material: Material) -> Evaluation:
+    """A look at the mean action while training: frames survived on the test fragments, from starts that stay the same.
+
+    Its ``score`` is the mean number of frames survived.
+    """
+    config = run.config
+    training = config["training"]
+    env = build_env(
+        config,
+        material,
+        "test",
+        worlds=int(training["evaluation_worlds"]),
+        threads=int(config["collector"]["physics_threads"]),
+    )
+
+    def evaluate(iteration: int) -> dict[str, float]:
+        env.load_state_dict(transform_state(run.collector))
+        survival = frames_survived(env, copy.deepcopy(run.ppo.actor), int(training["evaluation_seed"]))
+        return {"score": survival.mean, "falls": float(survival.fell.double().mean())}
+
+    return evaluate
+
+
+@dataclass(frozen=True)
+class Agent:
+    """A trained policy and what it was trained on.
+
+    Attributes:
+        actor, critic: in evaluation mode.
+        config: resolved, of its run.
+        material: see :class:`Material`.
+        make_env: ``make_env(split="test", worlds=1, ...)`` as :func:`build_env`, with the normaliser as trained and
+            frozen.
+        path: the checkpoint.
+    """
+
+    actor: TensorDictModuleBase
+    critic: TensorDictModuleBase
+    config: dict[str, Any]
+    material: Material
+    make_env: Callable[..., TransformedEnv]
+    path: Path
+
+
+def load_agent(
+    path: str | Path, material: Material | None = None, which: str = "best", overrides: Mapping[str, Any] | None = None
+) -> Agent:
+    """Networks and environment from a checkpoint.
+
+    Args:
+        path: a checkpoint folder or a run directory.
+        material: to run on; None for the one its configuration names.
+        which: of a run directory, the ``best`` or the ``latest`` checkpoint.
+        overrides: whole config groups in place of the run's own (``{"data": {...}}``).
+
+    Raises:
+        InputError: the checkpoint is damaged, or does not fit the material; names the field.
+    """
+    folder = find_checkpoint(path, which)
+    metadata = verify(folder)
+    config = {**read_json(folder, "config"), **(overrides or {})}
+    material = load_material(config) if material is None else material
+    env = build_env(config, material, worlds=1)
+    require(metadata, folder, task=str(config["task"]["name"]), action_size=int(env.action_spec.shape[-1]))
+    actor, critic = build_networks(config, material, env)
+    RunCheckpoint({"policy": actor, "critic": critic, "transforms": env}).restore(folder)
+    statistics = copy.deepcopy(env.state_dict())
+    env.close()
+
+    def make_env(split: str = "test", *, worlds: int = 1, **options: Any) -> TransformedEnv:
+        made = build_env(config, material, split, worlds=worlds, **options)
+        made.load_state_dict(statistics)
+        for module in made.transform.modules():
+            if isinstance(module, StateNormalizer):
+                module.freeze()
+        return made
+
+    return Agent(actor.eval(), critic.eval(), config, material, make_env, folder)
+
+
+def take_videos(config: Mapping[str, Any]) -> tuple[list[str], list[TakeVideo | None]]:
+    """Names of all takes of a prepared configuration, and the wearer's video of each where its file is there.
+
+    Raises:
+        InputError: the data is not prepared.
+    """
+    store = TakeStore.open(store_folder(config))
+    videos = [
+        TakeVideo(store.video(i), take.sync_offset, take.rendered) if store.video(i).is_file() else None
+        for i, take in enumerate(store.takes)
+    ]
+    return [take.name for take in store.takes], videos

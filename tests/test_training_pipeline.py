@@ -1,0 +1,129 @@
+"""Training on the real environment with a stand-in body: resumes to the bit, loads into TorchRL's own tools."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from env_stand_in import PIECES, group
+from humanoid_stand_in import reference_motion, stand_in
+from torchrl.collectors import Evaluator
+from torchrl.render import load_checkpoint
+from toy_problem import COLLECTOR, LOOP, SETTINGS
+
+from egopose import pipeline
+from egopose.envs.transforms import StateNormalizer
+from egopose.errors import InputError
+from egopose.material import Material
+from egopose.training.checkpoint import compare_states
+from egopose.training.loop import train
+
+
+@pytest.fixture(scope="module")
+def material() -> Material:
+    humanoid: Any = stand_in()
+    reference, takes = reference_motion(humanoid)
+    generator = torch.Generator().manual_seed(0)
+    frames = reference.shape[0]
+    return Material(
+        humanoid,
+        reference,
+        takes,
+        PIECES,
+        PIECES,
+        visual_features=torch.randn(frames, 6, generator=generator),
+        visual_context=torch.randn(frames, 5, generator=generator),
+        joint_targets=reference["qpos"][:, 7:].float(),
+    )
+
+
+def configuration(context: str = "frozen", **training: Any) -> dict[str, Any]:
+    loop = {**LOOP, "steps_per_iteration": 48, "iterations": 4, "checkpoint_every": 2, **training}
+    model = group("model", "fast")
+    return {
+        "seed": 5,
+        "task": {**group("task", "residual"), "horizon": 12, "minimum": 6},
+        "reward": group("reward", "estimation"),
+        "model": {**model, "hidden": [8], "context": {**model["context"], "source": context, "hidden_size": 4}},
+        "algo": {**SETTINGS, "minibatch_size": 16, **{k: loop.pop(k) for k in ("iterations", "steps_per_iteration")}},
+        "collector": {**COLLECTOR, "worlds": 4},
+        "training": {**loop, "evaluation_worlds": 2, "evaluation_seed": 1},
+    }
+
+
+@pytest.mark.parametrize("context", ["frozen", "trainable"])
+def test_resumed_equals_uninterrupted_to_the_bit(context: str, material: Material, tmp_path: Path) -> None:
+    whole = pipeline.build_run(configuration(context, evaluate_every=1), tmp_path / "whole", material)
+    train(whole, [], pipeline.build_evaluation(whole, material))
+    half = pipeline.build_run(configuration(context, evaluate_every=1, iterations=2), tmp_path / "half", material)
+    outcome = train(half, [], pipeline.build_evaluation(half, material))
+    torch.manual_seed(123)
+    again = pipeline.build_run({**configuration(context, evaluate_every=1), "seed": 9}, tmp_path / "half", material)
+    again.restore(outcome.checkpoint)
+    train(again, [], pipeline.build_evaluation(again, material))
+    for name, part in whole.checkpoint().components.items():
+        if name in ("policy", "critic", "transforms", "simulation"):
+            assert_equal(part.state_dict(), again.checkpoint().components[name].state_dict(), name)
+
+
+def assert_equal(first: Any, second: Any, where: str) -> None:
+    if isinstance(first, dict):
+        assert set(first) == set(second)
+        for key in first:
+            assert_equal(first[key], second[key], f"{where}.{key}")
+    else:
+        assert torch.equal(first, second), where
+
+
+@pytest.fixture(scope="module")
+def trained(material: Material, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("trained")
+    run = pipeline.build_run(configuration(), folder, material)
+    train(run, [])
+    return folder
+
+
+def test_an_agent_is_what_was_trained(trained: Path, material: Material) -> None:
+    agent = pipeline.load_agent(trained, material, which="latest")
+    env = agent.make_env(worlds=3)
+    (normalizer,) = (m for m in env.transform.modules() if isinstance(m, StateNormalizer))
+    assert normalizer.frozen
+    assert normalizer.count > 100
+    before = normalizer.mean.clone()
+    env.rollout(5, agent.actor, break_when_any_done=False)
+    assert torch.equal(before, normalizer.mean)
+    weights = load_checkpoint(agent.path)["model_state_dict"]
+    compare_states(agent.actor.state_dict(), weights, "policy")
+
+
+def test_an_agent_for_other_features_is_refused(trained: Path, material: Material) -> None:
+    wider = Material(**{**vars(material), "visual_context": torch.zeros(material.reference.shape[0], 7)})
+    with pytest.raises(InputError, match=r"critic\..*has shape \[300, 56\] where \[300, 58\]"):
+        pipeline.load_agent(trained, wider, which="latest")
+
+
+def test_torchrl_evaluator_runs_it(trained: Path, material: Material) -> None:
+    agent = pipeline.load_agent(trained, material, which="latest")
+    evaluator = Evaluator(agent.make_env(worlds=2), agent.actor, num_trajectories=2, max_steps=12)
+    try:
+        result = evaluator.evaluate()
+    finally:
+        evaluator.shutdown()
+    assert 0 < float(result["eval/reward"]) <= 12
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="starts processes")
+@pytest.mark.slow
+def test_two_processes_collect(material: Material, tmp_path: Path) -> None:
+    config = configuration(iterations=2)
+    config["collector"] = {**config["collector"], "kind": "multi_sync", "workers": 2}
+    run = pipeline.build_run(config, tmp_path, material)
+    try:
+        outcome = train(run, [])
+    finally:
+        run.collector.shutdown()
+    assert outcome.frames == 96
+    pipeline.load_agent(outcome.checkpoint, material)
