@@ -75,8 +75,13 @@ def mean_rotation(quats: Array) -> Array:
     return rot.from_scipy(rot.to_scipy(quats).mean(), (1,))[0]
 
 
-def upright_frames(motion: Motion, body_map: BodyMap, quats: Array, points: dict[str, Array]) -> Array:
-    """Each source joint's orientation ``[J, 4]`` in the heading frame of an upright, forward-looking stance."""
+def neutral_stance(
+    motion: Motion, body_map: BodyMap, quats: Array, points: dict[str, Array]
+) -> tuple[Array, dict[str, Array]]:
+    """An upright, forward-looking stance in its heading frame: orientations ``[J, 4]`` and part positions ``[3]``.
+
+    The zero pose if it stands, else the mean of the clip's most upright frames.
+    """
     zero = np.tile(motion.skeleton.rest_qpos(), (len(_AXIS_TURNS), 1))
     zero[:, 3:7] = _AXIS_TURNS
     zero_positions, zero_quats = forward_kinematics(motion.skeleton, zero)
@@ -84,11 +89,15 @@ def upright_frames(motion: Motion, body_map: BodyMap, quats: Array, points: dict
     stands = uprightness(zero_points)
     best = int(np.argmax(stands))
     if stands[best] > _UPRIGHT:
-        return rot.multiply(rot.conjugate(facing(zero_points)[best])[None], zero_quats[best])
-    upright = uprightness(points)
-    frames = upright >= min(np.quantile(upright, 0.8), _UPRIGHT)
-    relative = rot.multiply(rot.conjugate(facing(points))[:, None], quats)[frames]
-    return np.stack([mean_rotation(relative[:, j]) for j in range(relative.shape[1])])
+        quats, points, frames = zero_quats, zero_points, np.arange(len(stands)) == best
+    else:
+        upright = uprightness(points)
+        frames = upright >= min(np.quantile(upright, 0.8), _UPRIGHT)
+    turn = rot.conjugate(facing(points))
+    relative = rot.multiply(turn[:, None], quats)[frames]
+    orientations = np.stack([mean_rotation(relative[:, j]) for j in range(relative.shape[1])])
+    stance = {part: rot.rotate(turn, p - points["hips"])[frames].mean(axis=0) for part, p in points.items()}
+    return orientations, stance
 
 
 def frame_from(first: Array, second: Array) -> Rotation:

@@ -1,7 +1,7 @@
 """Which joint of a foreign skeleton plays which part of a human body.
 
-Only four words have to be recognised in the names (foot or ankle, hand or wrist, head, and a side); the rest follows
-from the tree: the knee is the ankle's parent, the chest the place where the arms meet, the hips where the legs meet.
+Only four words have to be recognised in the names (foot or ankle, hand or wrist, head or neck, and a side); the rest
+follows from the tree: the knee is the ankle's parent, the chest is where the arms meet, the hips are where the legs do.
 """
 
 from __future__ import annotations
@@ -73,7 +73,7 @@ def identify(skeleton: Skeleton, overrides: dict[str, str] | None = None) -> Bod
         _limb(skeleton, parts, side, ("foot", "shin", "thigh"), ("ankle", "foot"))
         _limb(skeleton, parts, side, ("hand", "forearm", "arm"), ("wrist", "hand"))
     if "head" not in parts:
-        parts["head"] = _find(skeleton, ("head",), None, "head")
+        parts["head"] = _find(skeleton, ("head", "neck"), None, "head")
     hips = parts.setdefault("hips", _common(skeleton, parts["left_thigh"], parts["right_thigh"]))
     chest = _common(skeleton, parts["left_arm"], parts["right_arm"])
     for side in SIDES:

@@ -22,8 +22,8 @@ from egopose.motion.calibration import (
     bone_direction,
     floor_normal,
     mean_rotation,
+    neutral_stance,
     part_positions,
-    upright_frames,
 )
 from egopose.motion.inverse_kinematics import Targets, solve_in_time
 from egopose.motion.kinematics import forward_kinematics
@@ -53,11 +53,11 @@ _FLAT_FOOT = np.deg2rad(20.0)
 _BEND_EVIDENCE = 0.05
 MODEL_SPINE = ("Spine", "Spine1", "Spine2", "Spine3")
 #: Links along which positions are scaled: part -> the part it is measured from.
-_LINKS = {"neck": "hips", "head": "neck", "crown": "neck"} | {
-    f"{side}_{part}": above if above in ("hips", "neck") else f"{side}_{above}"
+_LINKS = {"neck": "centre", "head": "neck", "crown": "neck"} | {
+    f"{side}_{part}": above if above in ("centre", "neck") else f"{side}_{above}"
     for side in SIDES
     for part, above in {
-        "thigh": "hips",
+        "thigh": "centre",
         "shin": "thigh",
         "foot": "shin",
         "toe": "foot",
@@ -65,6 +65,10 @@ _LINKS = {"neck": "hips", "head": "neck", "crown": "neck"} | {
         "forearm": "arm",
         "hand": "forearm",
     }.items()
+}
+#: Links inside the trunk -> the model joint whose frame they are constant or nearly constant in.
+_TRUNK_LINKS = {"neck": "Hips", "head": "Neck", "crown": "Neck"} | {
+    f"{side}_{part}": joint for side in SIDES for part, joint in {"thigh": "Hips", "arm": "Spine3"}.items()
 }
 
 
@@ -126,9 +130,10 @@ def retarget(
     positions, quats = motion.forward_kinematics()
     points = part_positions(body_map, positions, quats, motion.skeleton)
     model_rest = {part: p[0] for part, p in _model_points(model, model.rest_qpos()[None]).items()}
-    orientations = _orientations(motion, body_map, model, model_rest, quats, points)
+    neutral, stance = neutral_stance(motion, body_map, quats, points)
+    orientations = _orientations(motion, body_map, model, model_rest, quats, points, neutral)
     start = _read_hinges(model, orientations, limits)
-    scaled, scale = _scale(points, model_rest)
+    scaled, scale = _scale(points, stance, orientations, model_rest)
     start[:, :3] = scaled["hips"]
     targets = _targets(model, scaled, orientations)
     qpos = solve_in_time(model, start, targets, limits)
@@ -144,10 +149,10 @@ def _orientations(
     model_rest: dict[str, Array],
     quats: Array,
     points: dict[str, Array],
+    neutral: Array,
 ) -> dict[str, Array]:
     """World quaternions ``[T, 4]`` for the model's joints, carried over from the source's."""
     parts, out = body_map.parts, {}
-    neutral = upright_frames(motion, body_map, quats, points)
 
     def carried(joint: int, constant: Array | None = None) -> Array:
         return rot.multiply(quats[:, joint], (rot.conjugate(neutral[joint]) if constant is None else constant)[None])
@@ -287,8 +292,19 @@ def _tips(model: Skeleton) -> dict[str, tuple[int, Array]]:
     return {part: (j, np.array(model.joints[j].tips[0])) for part, j in joints.items()}
 
 
-def _scale(points: dict[str, Array], model_rest: dict[str, Array]) -> tuple[dict[str, Array], float]:
-    """Source positions with every link stretched to the model's length; the root by the ratio of the legs."""
+def _scale(
+    points: dict[str, Array], stance: dict[str, Array], orientations: dict[str, Array], model_rest: dict[str, Array]
+) -> tuple[dict[str, Array], float]:
+    """Source positions with every link stretched to the model's length, measured from the middle of the hip joints.
+
+    Limbs keep the source's directions. Inside the trunk rigs place joints differently (a root above the hips, a neck
+    ahead of the spine): those links are first turned by what sets the source's neutral stance apart from the model's.
+    """
+
+    def with_centre(p: dict[str, Array]) -> dict[str, Array]:
+        return p | {"centre": (p["left_thigh"] + p["right_thigh"]) / 2}
+
+    points, stance, model_rest = with_centre(points), with_centre(stance), with_centre(model_rest)
 
     def length(part: str, above: str) -> float:
         return float(np.median(np.linalg.norm(points[part] - points[above], axis=1)))
@@ -297,12 +313,19 @@ def _scale(points: dict[str, Array], model_rest: dict[str, Array]) -> tuple[dict
     scale = sum(float(np.linalg.norm(model_rest[a] - model_rest[b])) for a, b in legs) / sum(
         length(a, b) for a, b in legs
     )
-    scaled = {"hips": points["hips"] * scale}
+    scaled = {"centre": points["centre"] * scale}
     for part, above in _LINKS.items():
         if part not in points or above not in scaled or length(part, above) < 0.02:
             continue
-        ratio = np.linalg.norm(model_rest[part] - model_rest[above]) / length(part, above)
-        scaled[part] = scaled[above] + (points[part] - points[above]) * ratio
+        link, model_link = points[part] - points[above], model_rest[part] - model_rest[above]
+        frame = _TRUNK_LINKS.get(part)
+        if frame is not None:
+            bias = rot.between(stance[part] - stance[above], model_link)
+            local = rot.rotate(rot.conjugate(orientations[frame]), link)
+            link = rot.rotate(orientations[frame], rot.rotate(bias[None], local))
+        scaled[part] = scaled[above] + link * np.linalg.norm(model_link) / length(part, above)
+    hips = model_rest["hips"] - model_rest["centre"]
+    scaled["hips"] = scaled.pop("centre") + rot.rotate(orientations["Hips"], hips[None])
     return scaled, scale
 
 
