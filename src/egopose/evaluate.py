@@ -33,12 +33,14 @@ class Results:
         comparison: the table.
         survival: frames survived per run, see :func:`egopose.evaluation.agents.survival_figures`.
         videos: the side-by-side MP4s.
+        rendered: whether any take's wearer's video is rendered and not filmed.
     """
 
     folder: Path
     comparison: Comparison
     survival: list[dict[str, dict[str, float]]]
     videos: list[Path]
+    rendered: bool
 
 
 def run_evaluation(
@@ -91,10 +93,11 @@ def run_evaluation(
         survival.append(
             survival_figures(agent, start_policy, split, int(survive["worlds"]), int(survive["seed"]), threads)
         )
+    rendered = any(v is not None and v.rendered for v in videos)
     about = {
         "checkpoints": [str(agent.path) for agent in agents],
         "split": split,
-        "rendered_video": any(v is not None and v.rendered for v in videos),
+        "rendered_video": rendered,
         "settings": {key: config[key] for key in ("failsafe", "contact", "interval", "survival")},
         "survival": survival,
     }
@@ -111,19 +114,20 @@ def run_evaluation(
         motions = {"reference": result.reference, "estimate": result.motion}
         report.write_side_by_side(path, material.humanoid, motions, video, fragment.start, int(config["video"]["size"]))
         written.append(path)
-    return Results(out, comparison, survival, written)
+    return Results(out, comparison, survival, written, rendered)
 
 
 def summary(results: Results) -> str:
     """What the terminal shows at the end."""
     from egopose.evaluation import tables
-    from egopose.evaluation.report import HEADLINE
+    from egopose.evaluation.report import HEADLINE, RENDERED_NOTE
 
     lines = [tables.as_text(results.comparison, HEADLINE)]
     for run, figures in enumerate(results.survival):
         parts = ", ".join(f"{name.replace('_', ' ')} {found['frames']:.1f}" for name, found in figures.items())
         lines.append(f"frames survived (run {run}): {parts}")
     lines += [f"video: {path}" for path in results.videos]
+    lines += [RENDERED_NOTE] if results.rendered else []
     return "\n".join([*lines, f"all results: {results.folder}"])
 
 

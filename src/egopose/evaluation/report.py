@@ -18,6 +18,7 @@ from egopose.motion.motion import Motion
 from egopose.vision.video import iter_frames, write_video
 
 OURS, BASELINE = "ours", "PoseReg"
+RENDERED_NOTE = "The wearer's video was rendered from real motion capture, not filmed."
 HEADLINE = ("E_pose", "E_vel", "A_accl", "mpjpe_root_aligned", "root_drift", "foot_skate", "contact_accuracy")
 
 
@@ -50,14 +51,21 @@ def write_results(
     runs: Sequence[Sequence[FragmentResult]],
     about: Mapping[str, Any],
 ) -> None:
-    """``results.json`` (``about`` goes into it beside the figures), ``results.md`` and ``takes.csv`` in ``folder``."""
+    """``results.json``, ``results.md`` and ``takes.csv`` in ``folder``.
+
+    ``about`` goes into the JSON beside the figures; it says at least ``split`` and ``rendered_video``.
+    """
     folder.mkdir(parents=True, exist_ok=True)
     reference = {m.key: m.scale * _mean([take.reference_scores.figure(m.key) for take in runs[0]]) for m in METRICS}
     resets = [[take.estimate.n_resets for take in run] for run in runs]
     diverged = sum(take.estimate.diverged for run in runs for take in run)
     found = {"reference": reference, "resets_per_take": resets, "diverged": diverged}
     tables.write_json(folder / "results.json", {**about, **tables.as_dict(comparison), **found})
-    (folder / "results.md").write_text(tables.as_markdown(comparison))
+    runs_and_takes = (
+        f"{len(runs)} run{'s' if len(runs) > 1 else ''} on {len(runs[0])} fragments, split {about['split']}."
+    )
+    notes = [runs_and_takes, *([RENDERED_NOTE] if about["rendered_video"] else [])]
+    (folder / "results.md").write_text(tables.as_markdown(comparison) + "\n" + "\n".join(notes) + "\n")
     tables.write_csv(folder / "takes.csv", comparison)
 
 
