@@ -6,6 +6,7 @@ from egopose.runtime import prepare_runtime
 
 prepare_runtime()
 
+import logging  # noqa: E402
 import sys  # noqa: E402
 from pathlib import Path  # noqa: E402
 from typing import Any  # noqa: E402
@@ -67,6 +68,8 @@ def hydra_main(config: DictConfig) -> float:
     from egopose.training.resume import resumed_config
 
     state = HydraConfig.get()
+    # MuJoCo warns here of every world that diverges; they are counted, and their last states kept.
+    logging.getLogger("absl").setLevel(logging.ERROR)
     try:
         if config.resume is None:
             return run_training(absolute_paths(resolved(config)), Path(state.runtime.output_dir).resolve())
