@@ -35,10 +35,13 @@ def part_positions(body_map: BodyMap, positions: Array, quats: Array, skeleton: 
     points = {part: positions[:, i] for part, i in body_map.parts.items()}
 
     def tip(joint: int) -> Array | None:
-        tips = skeleton.joints[joint].tips
-        if not tips or np.linalg.norm(tips[0]) < 0.02:
+        """The joint's far end: its end site, or the middle of the furthest ones (the front corners of a sole)."""
+        tips = np.array(skeleton.joints[joint].tips).reshape(-1, 3)
+        reach = np.linalg.norm(tips, axis=1)
+        if not len(tips) or reach.max() < 0.02:
             return None
-        return positions[:, joint] + rot.rotate(quats[:, joint], np.array(tips[0])[None])
+        far = tips[reach > 0.9 * reach.max()].mean(axis=0)
+        return positions[:, joint] + rot.rotate(quats[:, joint], far[None])
 
     if "neck" not in points:
         # The head's joint is where the neck begins; the head is then its tip, if there is one.

@@ -1,0 +1,1 @@
+"""Motion clips that ship with egopose; see NOTICE.md beside this file."""
