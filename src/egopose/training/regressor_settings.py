@@ -15,6 +15,7 @@ class RegressorSettings:
     Args:
         hidden, context_size, dropout, feature_dropout: see :class:`StateRegressor`.
         std_floor: see :func:`egopose.models.regressor.state_statistics`.
+        target_clip: normalised states are clipped to +- this in training and in the validation error, or None.
         fragment_length: frames the BiLSTM sees in training.
         margin: frames at either end of a fragment that carry no loss, unless the video begins or ends there.
         epochs: passes over the training frames.
@@ -43,6 +44,7 @@ class RegressorSettings:
     dropout: float
     feature_dropout: float
     std_floor: float
+    target_clip: float | None
     fragment_length: int
     margin: int
     epochs: int

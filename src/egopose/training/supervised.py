@@ -139,11 +139,11 @@ class _Trainer:
         lengths = torch.tensor([w.stop - w.start for w in windows])
         frames = np.concatenate([np.arange(w.start, w.stop) for w in windows])
         fragment_of = torch.repeat_interleave(torch.arange(len(windows)), lengths)
-        seen, wanted = take_frames(flow, frames), self.model.normalise(targets[torch.as_tensor(frames)])
+        seen, states = take_frames(flow, frames), targets[torch.as_tensor(frames)].float()
         if mirror is not None:
             flip = (torch.rand(len(windows), generator=generator) < 0.5)[fragment_of]
             seen[flip] = mirror.flow(seen[flip])
-            wanted[flip] = self.model.normalise(mirror.state(targets[torch.as_tensor(frames)[flip]].float()))
+            states[flip] = mirror.state(states[flip])
         seen = self._disturb(seen, fragment_of, len(windows), generator)
         # Only real frames pass the encoder: padding would enter its batch statistics.
         valid = torch.arange(int(lengths.max()))[None] < lengths[:, None]
@@ -151,6 +151,7 @@ class _Trainer:
         features = encoded.new_zeros(*valid.shape, encoded.shape[-1])
         features[valid] = encoded
         predicted = self.model.from_features(features, lengths)["normalised_state"][valid]
+        wanted = _wanted(self.model, states, self.settings)
         counts = torch.cat([w.carries_loss() for w in windows])
         return (predicted - wanted)[counts].square().mean(), int(counts.sum())
 
@@ -270,6 +271,12 @@ def train_regressor(
     return result
 
 
+def _wanted(model: StateRegressor, states: Tensor, settings: RegressorSettings) -> Tensor:
+    """Normalised states, glitches of the capture bounded: one frame in a hundred can be a third of the squared error."""
+    normalised = model.normalise(states)
+    return normalised if settings.target_clip is None else normalised.clamp(-settings.target_clip, settings.target_clip)
+
+
 def _validation_error(
     model: StateRegressor,
     flow: Flow,
@@ -285,7 +292,7 @@ def _validation_error(
     for span, context in held_out:
         outputs = predict_span(model, flow, span, settings.encode_batch)
         predicted.append(outputs["normalised_state"][context:])
-        wanted.append(model.normalise(targets[span.start + context : span.stop]))
+        wanted.append(_wanted(model, targets[span.start + context : span.stop], settings))
     truth = torch.cat(wanted)
     return (torch.cat(predicted) - truth).square().mean().item(), truth.square().mean().item()
 
