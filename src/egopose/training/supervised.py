@@ -272,7 +272,7 @@ def train_regressor(
 
 
 def _wanted(model: StateRegressor, states: Tensor, settings: RegressorSettings) -> Tensor:
-    """Normalised states, glitches of the capture bounded: one frame in a hundred can be a third of the squared error."""
+    """Normalised states, bounded: a hundredth of the frames can make a third of the joint velocities' squared error."""
     normalised = model.normalise(states)
     return normalised if settings.target_clip is None else normalised.clamp(-settings.target_clip, settings.target_clip)
 
