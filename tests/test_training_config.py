@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import torch
 from omegaconf import OmegaConf
 
 from egopose.config import compose_config, convert, from_mapping, resolved, run_directory
@@ -200,21 +199,6 @@ def test_resumed_by_command_with_more_iterations(finished: Path, launcher: Path,
     assert "after iteration 3" in out
     assert len((folder / "curves.csv").read_text().splitlines()) == 6
     assert read_json(find_checkpoint(folder), "config")["algo"]["iterations"] == 5
-    whole, _, err = command(launcher, tmp_path, "algo.iterations=5", "logger=csv", f"output={tmp_path / 'whole'}")
-    assert whole == 0, err
-    (other,) = (tmp_path / "whole").iterdir()
-    for part in ("policy", "critic"):
-        assert_same_files(find_checkpoint(folder), find_checkpoint(other), part)
-
-
-def assert_same_files(first: Path, second: Path, part: str) -> None:
-    folders = [next((path / "components").glob(f"*-{part}")) / "state" for path in (first, second)]
-    names = [sorted(p.name for p in folder.glob("*.memmap")) for folder in folders]
-    assert names[0] == names[1]
-    assert names[0]
-    for name in names[0]:
-        data = [torch.frombuffer(bytearray((folder / name).read_bytes()), dtype=torch.uint8) for folder in folders]
-        assert torch.equal(data[0], data[1])
 
 
 def test_what_a_run_keeps_cannot_be_changed(finished: Path, launcher: Path, tmp_path: Path) -> None:

@@ -171,5 +171,7 @@ def make_run(folder: Path, size: int = 2, worlds: int = 8, seed: int = 3, **sett
     actor, critic = networks(size)
     collector_settings = CollectorSettings.from_config({**COLLECTOR, **settings.pop("collector", {})})
     ppo = PPO(actor, critic, PPOSettings.from_config({**SETTINGS, **settings}))
-    collector = build_collector(collector_settings, partial(toy_worker, worlds, size), actor, loop["steps_per_iteration"])
+    collector = build_collector(
+        collector_settings, partial(toy_worker, worlds, size), actor, loop["steps_per_iteration"]
+    )
     return Run(ppo, collector, LoopSettings.from_config(loop), collector_settings, folder, config, action_size=size)
