@@ -144,7 +144,8 @@ def _make_videos(config: Mapping[str, Any], store: TakeStore, progress: bool) ->
     if not todo:
         return
     tests = _test_room_takes(config, store)
-    xml = humanoid_of(config).xml
+    # At the default rates, so that a video stays valid whatever rate is trained at.
+    xml = build_humanoid(HumanoidConfig.from_mapping(config["humanoid"])).xml
     jobs = [
         RenderJob(t.name, xml, store.clip(i).qpos, store.video(i), "test" if i in tests else "train")
         for i in todo
