@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -72,7 +73,7 @@ class HumanoidConfig:
                 JointRow(
                     name=str(r["name"]),
                     parent=r["parent"],
-                    axes=tuple(_vector(a) for a in r["axes"]),
+                    axes=tuple(_direction(a, source, f"joints.{r['name']}.axes") for a in r["axes"]),
                     range_deg=tuple((float(a), float(b)) for a, b in r["range_deg"]),
                     kp=float(r["kp"]),
                     torque_limit=float(r["torque_limit"]),
@@ -81,13 +82,16 @@ class HumanoidConfig:
                 )
                 for r in values["joints"]
             )
+            _check_rows(rows, source)
             names = {r.name for r in rows}
-            for row in rows:
-                if len(row.axes) != len(row.range_deg):
-                    raise InputError(source, f"joints.{row.name}.range_deg", f"needs {len(row.axes)} ranges")
-            for key in ("end_effectors", "hands", "feet"):
-                if unknown := set(values[key]) - names:
+            hinges = {f"{r.name}_{k}" for r in rows for k in range(len(r.axes))}
+            for key in ("end_effectors", "hands", "feet", "offsets", "tips", "rest_action_deg"):
+                if unknown := set(values[key]) - (hinges if key == "rest_action_deg" else names):
                     raise InputError(source, key, f"no such joints: {', '.join(sorted(unknown))}")
+            if values["head"] not in names:
+                raise InputError(source, "head", f"no such joint: {values['head']}")
+            if untipped := {*values["feet"], values["head"]} - set(values["tips"]):
+                raise InputError(source, "tips", f"needs {', '.join(sorted(untipped))}")
             return cls(
                 joints=rows,
                 offsets={k: _vector(v) for k, v in values["offsets"].items()},
@@ -141,6 +145,30 @@ _FLOATS = (
 def _vector(values: Any) -> Vector:
     x, y, z = (float(v) for v in values)
     return (x, y, z)
+
+
+def _direction(values: Any, source: str, field: str) -> Vector:
+    """The unit vector along ``values``, as MuJoCo takes it: an axis written to six digits is not quite one."""
+    x, y, z = _vector(values)
+    length = math.sqrt(x * x + y * y + z * z)
+    if not length > 1e-6:
+        raise InputError(source, field, f"[{x}, {y}, {z}] is no direction")
+    return (x / length, y / length, z / length)
+
+
+def _check_rows(rows: tuple[JointRow, ...], source: str) -> None:
+    """Raises InputError unless the rows are a tree with one root, parents first, a range for every hinge."""
+    seen: set[str] = set()
+    for row in rows:
+        if row.name in seen:
+            raise InputError(source, f"joints.{row.name}", "stands twice")
+        if (row.parent is None) != (not seen) or (row.parent is not None and row.parent not in seen):
+            raise InputError(
+                source, f"joints.{row.name}.parent", f"{row.parent!r} must stand before it; one root, first"
+            )
+        if len(row.axes) != len(row.range_deg):
+            raise InputError(source, f"joints.{row.name}.range_deg", f"needs {len(row.axes)} ranges")
+        seen.add(row.name)
 
 
 @dataclass(frozen=True)
