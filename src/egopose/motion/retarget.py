@@ -129,7 +129,7 @@ def retarget(
     body_map = identify(motion.skeleton, overrides)
     positions, quats = motion.forward_kinematics()
     points = part_positions(body_map, positions, quats, motion.skeleton)
-    model_rest = {part: p[0] for part, p in _model_points(model, model.rest_qpos()[None]).items()}
+    model_rest = {part: p[0] for part, p in model_points(model, model.rest_qpos()[None]).items()}
     neutral, stance = neutral_stance(motion, body_map, quats, points)
     orientations = _orientations(motion, body_map, model, model_rest, quats, points, neutral)
     start = _read_hinges(model, orientations, limits)
@@ -278,7 +278,7 @@ def _within(angles: Array, axes: Array, low: Array, high: Array) -> Array:
     return np.take_along_axis(np.stack(ways), np.argmin(cost, axis=0)[None, :, None], axis=0)[0]
 
 
-def _model_points(model: Skeleton, qpos: Array) -> dict[str, Array]:
+def model_points(model: Skeleton, qpos: Array) -> dict[str, Array]:
     """The model's position ``[T, 3]`` of every part (toe and crown: tips)."""
     positions, quats = forward_kinematics(model, qpos)
     points = {part: positions[:, model.index(name)] for part, name in MODEL_PARTS.items()}
@@ -366,7 +366,7 @@ def _report(
     scale: float,
 ) -> RetargetReport:
     _, quats = forward_kinematics(model, qpos)
-    reached = _model_points(model, qpos)
+    reached = model_points(model, qpos)
     mm, degrees = {}, {}
     for part, target in scaled.items():
         distance = 1000 * np.linalg.norm(reached[part] - target, axis=1)
