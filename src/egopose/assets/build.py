@@ -29,8 +29,8 @@ def sources(assimp: Path, pybullet: Path, cmu60: Path) -> Iterator[tuple[str, Pa
     """Name and file of every embedded clip."""
     for trial in ("01_01", "01_03"):
         yield f"cmu01_{trial[3:]}", assimp / f"{trial}.bvh"
-    for trial in range(2, 11):
-        yield f"cmu07_{trial:02}", cmu60 / "007" / f"007_{trial:02}.bvh"
+    for number in range(2, 11):
+        yield f"cmu07_{number:02}", cmu60 / "007" / f"007_{number:02}.bvh"
     for clip in ("walk", "cartwheel"):
         yield f"deepmimic_{clip}", pybullet / f"humanoid3d_{clip}.txt"
     for clip in ("0walk_forward", "turn_left0", "turn_left1", "turn_right0", "turn_right1"):
