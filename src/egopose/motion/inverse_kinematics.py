@@ -149,51 +149,76 @@ def _solve(
     damping: float,
     stay: float,
 ) -> Array:
-    moves, n = _moves(skeleton), skeleton.n_dofs
-    qpos, frames = start.copy(), len(start)
+    n = skeleton.n_dofs
+    best, trial = start.copy(), start.copy()
+    normal, gradient, cost = _normal_equations(skeleton, trial, start, targets, stay)
+    squared = np.full(len(start), damping**2)
+    for iteration in range(iterations):
+        if iteration:
+            # A full step from a nearly straight limb can throw it anywhere: a worse frame goes back and steps shorter.
+            new_normal, new_gradient, new_cost = _normal_equations(skeleton, trial, start, targets, stay)
+            better = new_cost < cost
+            best[better], normal[better], gradient[better] = trial[better], new_normal[better], new_gradient[better]
+            cost[better] = new_cost[better]
+            squared = np.where(better, np.maximum(squared / 10, damping**2), squared * 30)
+        damped = normal + squared[:, None, None] * np.eye(6 + n)
+        pull = gradient.copy()
+        if limits is not None:
+            # A hinge pressed against its limit is held there, else the others would count on its moving on.
+            pressed = np.zeros(gradient.shape, dtype=bool)
+            pressed[:, 6:] = ((best[:, 7:] <= limits[:, 0]) & (gradient[:, 6:] < 0)) | (
+                (best[:, 7:] >= limits[:, 1]) & (gradient[:, 6:] > 0)
+            )
+            pull[pressed] = 0.0
+            free = ~pressed
+            damped *= free[:, :, None] & free[:, None, :]
+            damped += pressed[:, :, None] * np.eye(6 + n)
+        step = np.clip(np.linalg.solve(damped, pull[..., None])[..., 0], -0.5, 0.5)
+        trial = best.copy()
+        trial[:, :3] += step[:, :3]
+        trial[:, 3:7] = rot.normalize(rot.multiply(rot.from_rotvec(step[:, 3:6]), trial[:, 3:7]))
+        trial[:, 7:] += step[:, 6:]
+        if limits is not None:
+            trial[:, 7:] = np.clip(trial[:, 7:], limits[:, 0], limits[:, 1])
+    last = _cost(skeleton, trial, targets) + stay**2 * np.sum((trial - start)[:, 7:] ** 2, axis=1)
+    return np.where((last < cost)[:, None], trial, best)
+
+
+def _normal_equations(
+    skeleton: Skeleton, qpos: Array, start: Array, targets: Targets, stay: float
+) -> tuple[Array, Array, Array]:
+    """Gauss-Newton's matrix ``[T, 6 + D, 6 + D]``, right side ``[T, 6 + D]`` and the cost ``[T]`` (m^2) at ``qpos``."""
+    moves, n, frames = _moves(skeleton), skeleton.n_dofs, len(qpos)
     w_p, w_o = targets.position_weight[:, None], targets.orientation_weight[:, None]
     k, m = len(targets.point_joint), len(targets.frame_joint)
-    for _ in range(iterations):
-        positions, quats = forward_kinematics(skeleton, qpos)
-        points = positions[:, targets.point_joint] + rot.rotate(
-            quats[:, targets.point_joint], targets.point_offset[None]
-        )
-        axes = _hinge_axes(skeleton, qpos, quats)
-        origins = positions[:, skeleton.dof_joint]
-        jacobian = np.zeros((frames, 3 * (k + m), 6 + n))
-        arm = points[:, :, None] - origins[:, None]
-        turn = np.cross(np.broadcast_to(axes[:, None], arm.shape), arm) * moves[targets.point_joint][None, :, :, None]
-        jacobian[:, : 3 * k, 6:] = (turn * w_p[None, :, None]).transpose(0, 1, 3, 2).reshape(frames, 3 * k, n)
-        eye = np.eye(3)
-        jacobian[:, : 3 * k, :3] = (eye[None] * w_p[..., None]).reshape(3 * k, 3)
-        arm = points - positions[:, :1]
-        # d(point)/d(world rotation vector of the root) = -[arm]x
-        cross = np.zeros((frames, k, 3, 3))
-        cross[..., 0, 1], cross[..., 0, 2] = arm[..., 2], -arm[..., 1]
-        cross[..., 1, 0], cross[..., 1, 2] = -arm[..., 2], arm[..., 0]
-        cross[..., 2, 0], cross[..., 2, 1] = arm[..., 1], -arm[..., 0]
-        jacobian[:, : 3 * k, 3:6] = (cross * w_p[None, ..., None]).reshape(frames, 3 * k, 3)
-        spin = axes[:, None] * moves[targets.frame_joint][None, :, :, None]
-        jacobian[:, 3 * k :, 6:] = (spin * w_o[None, :, None]).transpose(0, 1, 3, 2).reshape(frames, 3 * m, n)
-        jacobian[:, 3 * k :, 3:6] = (eye[None] * w_o[..., None]).reshape(3 * m, 3)
-        off = rot.multiply(targets.orientations, rot.conjugate(quats[:, targets.frame_joint]))
-        residual = np.concatenate(
-            [
-                ((targets.positions - points) * w_p).reshape(frames, -1),
-                (rot.to_rotvec(off) * w_o).reshape(frames, -1),
-            ],
-            axis=1,
-        )
-        normal = np.einsum("tri,trj->tij", jacobian, jacobian, optimize=True)
-        gradient = np.einsum("tri,tr->ti", jacobian, residual)
-        normal[:, np.arange(6 + n), np.arange(6 + n)] += damping**2
-        normal[:, np.arange(6, 6 + n), np.arange(6, 6 + n)] += stay**2
-        gradient[:, 6:] += stay**2 * (start[:, 7:] - qpos[:, 7:])
-        step = np.linalg.solve(normal, gradient[..., None])[..., 0]
-        step = np.clip(step, -0.5, 0.5)
-        qpos[:, :3] += step[:, :3]
-        qpos[:, 3:7] = rot.normalize(rot.multiply(rot.from_rotvec(step[:, 3:6]), qpos[:, 3:7]))
-        qpos[:, 7:] += step[:, 6:]
-        if limits is not None:
-            qpos[:, 7:] = np.clip(qpos[:, 7:], limits[:, 0], limits[:, 1])
-    return qpos
+    positions, quats = forward_kinematics(skeleton, qpos)
+    points = positions[:, targets.point_joint] + rot.rotate(quats[:, targets.point_joint], targets.point_offset[None])
+    axes = _hinge_axes(skeleton, qpos, quats)
+    origins = positions[:, skeleton.dof_joint]
+    jacobian = np.zeros((frames, 3 * (k + m), 6 + n))
+    arm = points[:, :, None] - origins[:, None]
+    turn = np.cross(np.broadcast_to(axes[:, None], arm.shape), arm) * moves[targets.point_joint][None, :, :, None]
+    jacobian[:, : 3 * k, 6:] = (turn * w_p[None, :, None]).transpose(0, 1, 3, 2).reshape(frames, 3 * k, n)
+    eye = np.eye(3)
+    jacobian[:, : 3 * k, :3] = (eye[None] * w_p[..., None]).reshape(3 * k, 3)
+    arm = points - positions[:, :1]
+    # d(point)/d(world rotation vector of the root) = -[arm]x
+    cross = np.zeros((frames, k, 3, 3))
+    cross[..., 0, 1], cross[..., 0, 2] = arm[..., 2], -arm[..., 1]
+    cross[..., 1, 0], cross[..., 1, 2] = -arm[..., 2], arm[..., 0]
+    cross[..., 2, 0], cross[..., 2, 1] = arm[..., 1], -arm[..., 0]
+    jacobian[:, : 3 * k, 3:6] = (cross * w_p[None, ..., None]).reshape(frames, 3 * k, 3)
+    spin = axes[:, None] * moves[targets.frame_joint][None, :, :, None]
+    jacobian[:, 3 * k :, 6:] = (spin * w_o[None, :, None]).transpose(0, 1, 3, 2).reshape(frames, 3 * m, n)
+    jacobian[:, 3 * k :, 3:6] = (eye[None] * w_o[..., None]).reshape(3 * m, 3)
+    off = rot.multiply(targets.orientations, rot.conjugate(quats[:, targets.frame_joint]))
+    residual = np.concatenate(
+        [((targets.positions - points) * w_p).reshape(frames, -1), (rot.to_rotvec(off) * w_o).reshape(frames, -1)],
+        axis=1,
+    )
+    moved = start[:, 7:] - qpos[:, 7:]
+    normal = jacobian.transpose(0, 2, 1) @ jacobian
+    normal[:, np.arange(6, 6 + n), np.arange(6, 6 + n)] += stay**2
+    gradient = np.einsum("tri,tr->ti", jacobian, residual)
+    gradient[:, 6:] += stay**2 * moved
+    return normal, gradient, np.sum(residual**2, axis=1) + stay**2 * np.sum(moved**2, axis=1)
