@@ -13,6 +13,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from egopose.motion import rotations as rot
+from egopose.motion.contacts import point_speeds
 from egopose.motion.kinematics import forward_kinematics
 from egopose.motion.mapping import SIDES, BodyMap
 from egopose.motion.motion import Motion
@@ -151,10 +152,7 @@ def bend_axis(quats: Array, upper: Array, lower: Array) -> tuple[Array, float]:
 
 def floor_normal(quats: Array, ankle: Array, toe: Array, fps: float) -> Array:
     """The floor's normal ``[3]`` in the foot's frame: the mean of up while the foot stands (low and slow)."""
-    speed = (
-        np.linalg.norm(np.gradient(toe, axis=0), axis=1) * fps
-        + np.linalg.norm(np.gradient(ankle, axis=0), axis=1) * fps
-    )
+    speed = point_speeds(np.stack([ankle, toe], axis=1), fps).sum(axis=1)
     height = ankle[:, 2] + toe[:, 2]
     score = (height - np.quantile(height, 0.02)) / 0.05 + speed / 0.5
     flat = score <= np.quantile(score, 0.2)

@@ -17,7 +17,9 @@ from egopose.motion.skeleton import Skeleton
 
 SIDES = ("right", "left")
 #: Helper bones that stand in a limb's chain in some rigs and carry no joint of their own.
-_HELPER = re.compile(r"twist|share|roll|helper|nub", re.IGNORECASE)
+_HELPER = re.compile(r"twist|share|roll|helper|nub|(?:^|[_.:])ik[_.]", re.IGNORECASE)
+_LIMB_PARTS = ("thigh", "shin", "foot", "toe", "clavicle", "arm", "forearm", "hand")
+_PARTS = ("hips", "neck", "head", *(f"{side}_{part}" for side in SIDES for part in _LIMB_PARTS))
 
 _LIMB_WORDS = (
     "foot|ankle|hand|wrist|hip|femur|tibia|toe|clavicle|humerus|radius|knee|elbow|shoulder|collar|thigh|shin|arm|leg"
@@ -66,6 +68,10 @@ def identify(skeleton: Skeleton, overrides: dict[str, str] | None = None) -> Bod
     """
     overrides = overrides or {}
     for part, name in overrides.items():
+        if part not in _PARTS:
+            raise InputError(
+                skeleton.name or "skeleton", f"mapping.{part}", f"is no part; there are {', '.join(_PARTS)}"
+            )
         if name not in skeleton.names:
             raise InputError(skeleton.name or "skeleton", f"mapping.{part}", f"there is no joint {name!r}")
     parts: dict[str, int] = {part: skeleton.index(name) for part, name in overrides.items()}
