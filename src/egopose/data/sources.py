@@ -9,6 +9,7 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
+from egopose.config import convert
 from egopose.errors import InputError
 
 
@@ -69,12 +70,18 @@ def _in_folder(folder: Path, settings: Mapping[str, Any]) -> list[TakeSource]:
     if not folder.is_dir():
         raise InputError(folder, "data.folder", "is not a folder")
     excluded = set(settings.get("exclude") or ())
+    try:
+        subject = re.compile(settings["subject"])
+    except re.error as error:
+        raise InputError("data", "data.subject", f"{settings['subject']!r} is no regular expression: {error}") from None
+    if not subject.groups:
+        raise InputError("data", "data.subject", f"{settings['subject']!r} has no group (...) for the subject's name")
     out = []
     for path in sorted(folder.glob(settings["pattern"])):
         name = path.name.split(".")[0]
         if name in excluded:
             continue
-        match = re.match(settings["subject"], name)
+        match = subject.match(name)
         if match is None:
             raise InputError(path, "data.subject", f"{settings['subject']!r} does not match {name!r}")
         out.append(TakeSource(name, match[1], path, dict(settings.get("reader") or {})))
@@ -87,6 +94,8 @@ def _listed(rows: Sequence[Mapping[str, Any]], reader: dict[str, Any]) -> list[T
     out = []
     for number, row in enumerate(rows):
         label = f"data.takes[{number}]"
+        if not isinstance(row, Mapping):
+            raise InputError("data", label, f"must be {{motion: FILE, ...}}, not {row!r}")
         if unknown := set(row) - {"motion", "video", "sync_offset", "subject", "name", "reader", "mapping"}:
             raise InputError("data", label, f"has no setting {sorted(unknown)[0]!r}")
         for key in ("motion", "video"):
@@ -95,14 +104,17 @@ def _listed(rows: Sequence[Mapping[str, Any]], reader: dict[str, Any]) -> list[T
         if not row.get("motion"):
             raise InputError("data", f"{label}.motion", "is missing")
         motion = Path(row["motion"]).expanduser()
+        name = str(row.get("name") or motion.name.split(".")[0])
+        if name in (".", "..") or re.search(r"[/\\\0]", name):
+            raise InputError("data", f"{label}.name", f"{name!r} cannot be the name of a file")
         out.append(
             TakeSource(
-                str(row.get("name") or motion.name.split(".")[0]),
+                name,
                 str(row.get("subject", "1")),
                 motion,
                 {**reader, **(row.get("reader") or {})},
                 Path(row["video"]).expanduser().resolve() if row.get("video") else None,
-                float(row.get("sync_offset", 0.0)),
+                convert(row.get("sync_offset", 0.0), float, "data", f"{label}.sync_offset"),
                 dict(row["mapping"]) if row.get("mapping") else None,
             )
         )

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from egopose.config import convert
 from egopose.data.store import Fragment, TakeInfo
 from egopose.errors import InputError
 
@@ -27,8 +28,13 @@ def split_takes(
     Raises:
         InputError: an unknown setting, subject or kind, or nothing is left; names the field.
     """
-    kind, shortest = settings["kind"], int(settings["shortest"])
-    subjects = settings.get("subjects")
+    kind, subjects = settings["kind"], settings.get("subjects")
+    shortest = convert(settings["shortest"], int, "data.split", "shortest")
+    share = convert(settings.get("train_share"), float, "data.split", "train_share") if kind == "time" else 0.0
+    if not 0.0 <= share <= 1.0:
+        raise InputError("data.split", "train_share", f"must lie between 0 and 1, not {share}")
+    if kind == "subject" and not settings.get("test_subjects"):
+        raise InputError("data.split", "test_subjects", "is missing: say whose takes test, [1, 2]")
     known = {t.subject for t in takes}
     for key in ("subjects", "test_subjects"):
         if unknown := {str(s) for s in settings.get(key) or ()} - known:
@@ -40,7 +46,7 @@ def split_takes(
         if subjects is not None and take.subject not in {str(s) for s in subjects}:
             continue
         if kind == "time":
-            cut = round(take.length * float(settings["train_share"]))
+            cut = round(take.length * share)
             if take.length - cut < shortest:
                 cut = take.length
             spans = {"train": (0, cut), "test": (cut, take.length)}

@@ -30,6 +30,8 @@ from egopose.motion.io import read_motion, write_motion
 from egopose.motion.motion import Motion
 
 SCHEMA = 1
+#: What every frame of ``reference/`` has; see :func:`egopose.data.reference.reference_states`.
+REFERENCE_KEYS = ("qpos", "qvel", "xpos", "xquat", "com", "com_vel")
 
 
 @dataclass(frozen=True)
@@ -146,6 +148,8 @@ class TakeStore:
     def reference(self) -> TensorDict:
         """Body states ``[F]`` of all takes, float64, memory-mapped."""
         states = self._load(self.root / "reference", "reference")
+        if missing := set(REFERENCE_KEYS) - set(states.keys()):
+            raise InputError(self.root, "reference", f"is damaged: {', '.join(sorted(missing))} missing")
         if len(states) != self.frames_total:
             raise InputError(self.root, "reference", f"has {len(states)} frames, the takes {self.frames_total}")
         return states
@@ -180,7 +184,7 @@ class TakeStore:
     def flow_done(self, name: str) -> set[int]:
         """Takes whose flow is in."""
         path = self.root / "flow" / name / "done.json"
-        return set(json.loads(path.read_text())) if path.is_file() else set()
+        return {int(i) for i in _read_json(path, "done")} if path.is_file() else set()
 
     def open_flow(self, name: str, size: int) -> Tensor:
         """The flow table to be filled; made on first use."""
@@ -212,7 +216,10 @@ class TakeStore:
 
     def table_card(self, name: str) -> dict[str, Any]:
         """What the table's maker noted about it."""
-        return json.loads((self.root / "tables" / name / "card.json").read_text())
+        path = self.root / "tables" / name / "card.json"
+        if not path.is_file():
+            raise InputError(self.root, f"tables/{name}", "is missing")
+        return _read_json(path, "card")
 
     def write_table(self, name: str, tensors: dict[str, Tensor], card: dict[str, Any]) -> None:
         """Store a table whole, by renaming; one of the same name is replaced.
@@ -236,9 +243,29 @@ class TakeStore:
         if not folder.is_dir():
             raise InputError(self.root, field, "is missing: python -m egopose.prepare makes it")
         try:
+            _check_lengths(folder, field)
             return TensorDict.load_memmap(folder)
+        except InputError:
+            raise
         except Exception as error:  # tensordict raises whatever the damage happens to be
             raise InputError(folder, field, f"is damaged: {error}") from None
+
+
+def _check_lengths(folder: Path, field: str) -> None:
+    """Mapping a file that was cut off would fill it with zeros in silence: its length tells beforehand."""
+    for key, entry in json.loads((folder / "meta.json").read_text()).items():
+        if isinstance(entry, dict) and "dtype" in entry:
+            size = int(np.prod(entry["shape"])) * getattr(torch, entry["dtype"].removeprefix("torch.")).itemsize
+            file = folder / f"{key}.memmap"
+            if not file.is_file() or file.stat().st_size < size:
+                raise InputError(folder, field, f"is damaged: {file.name} is cut off or missing")
+
+
+def _read_json(path: Path, field: str) -> Any:
+    try:
+        return json.loads(path.read_text())
+    except ValueError as error:
+        raise InputError(path, field, f"is damaged: {error}") from None
 
 
 def runs_of(mask: np.ndarray) -> tuple[tuple[int, int], ...]:
