@@ -20,7 +20,7 @@ from egopose.config import compose_config
 from egopose.data.preparation import store_folder
 from egopose.data.store import TakeStore
 from egopose.envs import build as envs
-from egopose.envs.transforms import StateNormalizer, VisualContext
+from egopose.envs.transforms import StateNormalizer, TrackingError, VisualContext
 from egopose.errors import InputError
 from egopose.evaluation.report import TakeVideo
 from egopose.evaluation.survival import frames_survived
@@ -105,7 +105,22 @@ def build_env(
         if material.visual_context is None:
             raise InputError("configuration", "model.context.source", "frozen needs a trained state regressor")
         transforms.insert(0, VisualContext(material.visual_context))
+    if "tracking_error" in config["model"]["inputs"]:
+        if material.states is None:
+            raise InputError("configuration", "model.inputs", "tracking_error needs a trained state regressor")
+        transforms.insert(0, TrackingError(material.states, _state_scale(material)))
     return TransformedEnv(base, Compose(*transforms))
+
+
+def _state_scale(material: Material) -> torch.Tensor:
+    """``[S]``: deviation of the regressor's states on the training frames, floored for still numbers."""
+    assert material.states is not None
+    offsets = material.takes.offsets
+    rows = [material.states[int(offsets[f.take]) + f.start : int(offsets[f.take]) + f.stop] for f in material.train]
+    return torch.cat(rows).std(dim=0).clamp_min(_STATE_SCALE_FLOOR)
+
+
+_STATE_SCALE_FLOOR = 0.05  # m, rad, m/s, rad/s
 
 
 def build_networks(
@@ -119,7 +134,8 @@ def build_networks(
     settings = PolicySettings.from_config(config["model"])
     widths = {name: spec.shape[-1] for name, spec in env.observation_spec.items() if name != "reward_terms"}
     bounds = torch.stack([material.takes.offsets, material.takes.offsets + material.takes.lengths], dim=1)
-    actor = build_actor(settings, widths, env.action_spec.shape[-1], material.visual_features, bounds)
+    names = [f"{joint.name}_{k}" for joint in material.humanoid.skeleton.joints for k in range(len(joint.dofs))]
+    actor = build_actor(settings, widths, env.action_spec.shape[-1], material.visual_features, bounds, dof_names=names)
     return actor, build_critic(settings, widths, material.visual_features, bounds)
 
 

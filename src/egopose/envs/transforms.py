@@ -38,6 +38,44 @@ class VisualContext(Transform):
         return observation_spec
 
 
+class TrackingError(Transform):
+    """How the body's state differs from the state regressor's, and where the regressor goes next.
+
+    A controller that sees its error learns feedback with a nearly linear map; from state and context alone it has to
+    find the regressor's state in the context first. To stand before :class:`StateNormalizer`, which changes the state.
+
+    Args:
+        table: ``[F, S]``, the regressor's states in their own units.
+        scale: ``[S]``, what a unit of each number is divided by (a deviation).
+        clip: bound of the scaled numbers.
+        key: of what it writes, ``[..., 2 S]``: the scaled error, the regressor's scaled step to the next frame.
+    """
+
+    def __init__(self, table: Tensor, scale: Tensor, clip: float = 5.0, key: str = "tracking_error") -> None:
+        super().__init__(in_keys=["humanoid_state", "frame"], out_keys=[key])
+        self.table, self.scale, self.clip = table, scale, clip
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Writes :attr:`out_keys` from the raw ``humanoid_state`` and ``frame``."""
+        frame = tensordict["frame"].squeeze(-1)
+        now = self.table[frame]
+        ahead = self.table[(frame + 1).clamp(max=len(self.table) - 1)]
+        error = torch.cat([tensordict["humanoid_state"] - now, ahead - now], dim=-1) / self.scale.repeat(2)
+        return tensordict.set(self.out_keys[0], error.clamp(-self.clip, self.clip))
+
+    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
+        return self.forward(next_tensordict)
+
+    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
+        return self.forward(tensordict_reset)
+
+    def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
+        assert isinstance(observation_spec, Composite)
+        shape = (*observation_spec.shape, 2 * self.table.shape[-1])
+        observation_spec[self.out_keys[0]] = Unbounded(shape, dtype=self.table.dtype, device=observation_spec.device)
+        return observation_spec
+
+
 class StateNormalizer(Transform):
     """Running mean and deviation of an observation, normalised in place and clipped (the papers' online z-filter).
 

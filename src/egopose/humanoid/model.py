@@ -95,8 +95,8 @@ def build_humanoid(config: HumanoidConfig, sim: SimConfig | None = None) -> Huma
             gainprm=[p],
             biasprm=[0.0, -p, -(d + p * sim.timestep)],
         )
-        # The limit sits on the joint. On the actuator MuJoCo would drop the implicit damping while it holds, and a light
-        # limb at 150 Hz then diverges: 378 of 64 x 60 control steps on a walk with noisy targets, none this way.
+        # The limit sits on the joint. On the actuator MuJoCo would drop the implicit damping while it holds, and a
+        # light limb at 150 Hz then diverges: in 378 of 64 x 60 control steps with noisy targets, in none this way.
         hinge = root.find("joint", name)
         hinge.actuatorfrclimited, hinge.actuatorfrcrange = True, [-limit, limit]
     xml = root.to_xml_string()

@@ -22,6 +22,7 @@ from egopose.config import from_mapping
 from egopose.errors import InputError
 from egopose.models.context import BidirectionalContext
 from egopose.models.episode_context import EpisodeContext, episode_context_module
+from egopose.models.feedback import BalanceFeedback, FeedbackSettings
 
 _log = logging.getLogger(__name__)
 
@@ -57,6 +58,8 @@ class PolicySettings:
         sigma: standard deviation of each action, rad; where it is learned, its start.
         learn_sigma: one trained log-sigma an action.
         final_gain: gain of the orthogonal start of the actor's last layer.
+        feedback: see :class:`egopose.models.feedback.FeedbackSettings`, or None for none; reads ``tracking_error``.
+        inputs: further observation keys actor and critic read, such as ``tracking_error``.
         context: see :class:`ContextSettings`.
         critic: see :class:`CriticSettings`.
     """
@@ -66,6 +69,8 @@ class PolicySettings:
     sigma: float
     learn_sigma: bool
     final_gain: float
+    inputs: tuple[str, ...]
+    feedback: FeedbackSettings | None
     context: ContextSettings
     critic: CriticSettings
 
@@ -74,14 +79,16 @@ class PolicySettings:
         """From the resolved config group. Raises InputError naming the setting that is missing, unknown or wrong."""
         parts: dict[str, Any] = {
             name: from_mapping(part, config[name], f"model.{name}")
-            for name, part in (("context", ContextSettings), ("critic", CriticSettings))
-            if name in config
+            for name, part in (("context", ContextSettings), ("critic", CriticSettings), ("feedback", FeedbackSettings))
+            if config.get(name) is not None
         }
         settings = from_mapping(cls, {**config, **parts}, "model")
         if settings.context.source not in ("frozen", "trainable"):
             raise InputError("model", "context.source", f"must be frozen or trainable, not {settings.context.source!r}")
         if settings.activation not in _ACTIVATIONS:
             raise InputError("model", "activation", f"must be one of {', '.join(_ACTIVATIONS)}")
+        if settings.feedback is not None and "tracking_error" not in settings.inputs:
+            raise InputError("model", "feedback", "needs tracking_error among model.inputs")
         if not settings.sigma > 0:
             raise InputError("model", "sigma", f"must be positive, not {settings.sigma}")
         return settings
@@ -94,10 +101,19 @@ class GaussianHead(nn.Module):
         in_features: width of the concatenated inputs.
         action_size: degrees of freedom driven.
         settings: of the policy.
+        feedback: added to the mean; reads the input number ``feedback_input``.
     """
 
-    def __init__(self, in_features: int, action_size: int, settings: PolicySettings) -> None:
+    def __init__(
+        self,
+        in_features: int,
+        action_size: int,
+        settings: PolicySettings,
+        feedback: BalanceFeedback | None = None,
+        feedback_input: int = 0,
+    ) -> None:
         super().__init__()
+        self.feedback, self.feedback_input = feedback, feedback_input
         self.mean = _mlp(in_features, action_size, settings.hidden, settings.activation)
         last = self.mean[-1]
         # The start policy is the action's reference pose: any visible offset would make the body fall sooner.
@@ -112,6 +128,8 @@ class GaussianHead(nn.Module):
     def forward(self, *inputs: Tensor) -> tuple[Tensor, Tensor]:
         """Inputs ``[..., d_i]`` -> mean ``[..., A]`` and sigma ``[..., A]`` (rad)."""
         mean = self.mean(*inputs)
+        if self.feedback is not None:
+            mean = mean + self.feedback(inputs[self.feedback_input])
         return mean, self.log_sigma.exp().expand_as(mean)
 
 
@@ -122,6 +140,7 @@ def build_actor(
     features_table: Tensor | None = None,
     take_bounds: Tensor | None = None,
     state_key: str = "humanoid_state",
+    dof_names: Sequence[str] = (),
 ) -> TensorDictModuleBase:
     """The policy pi(a | z, phi): a diagonal Gaussian, its mean under ``ExplorationType.DETERMINISTIC``.
 
@@ -134,15 +153,19 @@ def build_actor(
         features_table: ``[F, D]`` visual features, only where the context is trainable.
         take_bounds: ``[K, 2]`` int64 global frames of the takes, only where the context is trainable.
         state_key: observation that holds the humanoid's state.
+        dof_names: of the actions, in order; read only where the settings have a feedback.
 
     Raises:
-        InputError: an observation the settings need is not there.
+        InputError: an observation or a hinge the settings need is not there.
     """
     context, context_key, context_width = _context(settings, widths, "visual_context", features_table, take_bounds)
-    head = GaussianHead(_width(widths, state_key, "humanoid_state") + context_width, action_size, settings)
-    module = TensorDictSequential(
-        *context, TensorDictModule(head, in_keys=[state_key, context_key], out_keys=["loc", "scale"])
-    )
+    width = _width(widths, state_key, "humanoid_state") + context_width
+    width += sum(_width(widths, key, "inputs") for key in settings.inputs)
+    in_keys = [state_key, context_key, *settings.inputs]
+    feedback = None if settings.feedback is None else BalanceFeedback(settings.feedback, dof_names)
+    at = in_keys.index("tracking_error") if feedback is not None else 0
+    head = GaussianHead(width, action_size, settings, feedback, at)
+    module = TensorDictSequential(*context, TensorDictModule(head, in_keys=in_keys, out_keys=["loc", "scale"]))
     actor = ProbabilisticActor(
         module,
         in_keys=["loc", "scale"],
@@ -168,7 +191,7 @@ def build_critic(
     context, context_key, context_width = _context(
         settings, widths, "critic_visual_context", features_table, take_bounds
     )
-    privileged = settings.critic.privileged
+    privileged = (*settings.inputs, *settings.critic.privileged)
     in_keys = [state_key, context_key, *privileged]
     width = _width(widths, state_key, "humanoid_state") + context_width
     width += sum(_width(widths, key, "critic.privileged") for key in privileged)
