@@ -275,7 +275,9 @@ def label_frame(frame: Frame, label: str) -> Frame:
     """A copy of the frame with a line of text at its upper left, readable on any ground."""
     frame = frame.copy()
     scale = frame.shape[0] / 480
-    at = (int(10 * scale) + 2, int(30 * scale) + 4)
-    for colour, thickness in (((0, 0, 0), 3), ((255, 255, 255), 1)):
-        cv2.putText(frame, label, at, cv2.FONT_HERSHEY_SIMPLEX, max(scale, 0.4), colour, thickness, cv2.LINE_AA)
+    x, y, size = int(10 * scale) + 2, int(30 * scale) + 4, max(scale, 0.4)
+    # The outline is the text itself, shifted: a thicker stroke is also wider in OpenCV 5, and ends elsewhere.
+    marks = [(dx, dy, (0, 0, 0)) for dx in (-1, 1) for dy in (-1, 1)] + [(0, 0, (255, 255, 255))]
+    for dx, dy, colour in marks:
+        cv2.putText(frame, label, (x + dx, y + dy), cv2.FONT_HERSHEY_SIMPLEX, size, colour, 1, cv2.LINE_AA)
     return frame
