@@ -9,16 +9,19 @@ from typing import Any
 import pytest
 import torch
 import yaml
+from mocap import default_humanoid
 from tensordict import TensorDict
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
 
 from egopose.errors import InputError
+from egopose.models.feedback import BalanceFeedback
 from egopose.models.policy import PolicySettings, build_actor, build_critic
 
 CONF = Path(__file__).resolve().parents[1] / "conf" / "model"
-WIDTHS = {"humanoid_state": 115, "visual_context": 128, "reference_state": 115}
+WIDTHS = {"humanoid_state": 115, "visual_context": 128, "reference_state": 115, "tracking_error": 230}
+HINGES = [f"{joint.name}_{k}" for joint in default_humanoid().skeleton.joints for k in range(len(joint.dofs))]
 BOUNDS = torch.tensor([[0, 300], [300, 800]])
 
 
@@ -30,7 +33,7 @@ def build(name: str, **changes: Any) -> tuple[Any, Any]:
     torch.manual_seed(0)
     settings = PolicySettings.from_config({**config(name), **changes})
     store = (torch.randn(800, 128), BOUNDS) if settings.context.source == "trainable" else (None, None)
-    return build_actor(settings, WIDTHS, 52, *store), build_critic(settings, WIDTHS, *store)
+    return build_actor(settings, WIDTHS, 52, *store, dof_names=HINGES), build_critic(settings, WIDTHS, *store)
 
 
 def observations(*batch: int) -> TensorDict:
@@ -123,12 +126,37 @@ def test_privileged_critic_reads_the_reference_and_the_actor_does_not() -> None:
         ({"context": {"source": "none", "hidden_size": 1, "horizon": 1, "padding": 1}}, "context.source"),
         ({"critic": {"hidden": [3]}}, "privileged"),
         ({"critic": {"hidden": [3], "privileged": ["wind"]}}, "critic.privileged"),
+        ({"inputs": ["tracking_error", "wind"]}, "inputs"),
+        ({"inputs": []}, "feedback"),
+        ({"feedback": {"pitch": [], "roll": []}}, "speed"),
+        ({"feedback": {"pitch": [["RightFoot_0"], ["Tail_0"]], "roll": [], "speed": 1.0}}, "feedback.pitch"),
+        ({"feedback": {"pitch": [], "roll": [["Tail_0"]], "speed": 1.0}}, "feedback.roll"),
     ],
 )
 def test_wrong_settings_are_named(change: dict[str, Any], field: str) -> None:
     with pytest.raises(InputError) as error:
         build("fast", **change)
     assert error.value.field == field
+
+
+@pytest.mark.parametrize("inputs", [["tracking_error"], ["reference_state", "tracking_error"]])
+def test_feedback_adds_to_the_mean_what_it_reads_off_the_tracking_error(inputs: list[str]) -> None:
+    actor, _ = build("fast", inputs=inputs)
+    (feedback,) = (m for m in actor.modules() if isinstance(m, BalanceFeedback))
+    td = observations(5)
+    with set_exploration_type(ExplorationType.DETERMINISTIC), torch.no_grad():
+        before = actor(td.clone())["action"]
+        feedback.gains.normal_()
+        after = actor(td.clone())["action"]
+        added = feedback(td["tracking_error"])
+    assert added.abs().max() > 0.1
+    torch.testing.assert_close(after - before, added, atol=1e-5, rtol=1e-5)
+
+
+def test_without_feedback_there_is_none() -> None:
+    actor, critic = build("paper")
+    assert not any(isinstance(m, BalanceFeedback) for m in (*actor.modules(), *critic.modules()))
+    assert "tracking_error" not in (*actor.in_keys, *critic.in_keys)
 
 
 def test_trainable_context_needs_the_features() -> None:
