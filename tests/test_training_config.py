@@ -31,11 +31,11 @@ def composed(*overrides: str) -> dict[str, Any]:
     return compose_config("train", overrides)
 
 
-@pytest.mark.parametrize("algo", ["paper", "fast"])
-def test_algo_files_fill_the_settings(algo: str) -> None:
+@pytest.mark.parametrize(("algo", "gamma"), [("paper", 0.95), ("fast", 0.99)])
+def test_algo_files_fill_the_settings(algo: str, gamma: float) -> None:
     values = composed(f"algo={algo}")["algo"]
     settings = PPOSettings.from_config({k: v for k, v in values.items() if k not in LOOP_KEYS})
-    assert (settings.gamma, settings.lmbda, settings.clip_epsilon) == (0.95, 0.95, 0.2)
+    assert (settings.gamma, settings.lmbda, settings.clip_epsilon) == (gamma, 0.95, 0.2)
 
 
 LOOP_KEYS = ("iterations", "steps_per_iteration")
@@ -207,6 +207,11 @@ def test_what_a_run_keeps_cannot_be_changed(finished: Path, launcher: Path, tmp_
     assert code == 2
     assert "algo.gamma" in err
     assert "Traceback" not in err
+
+
+@pytest.mark.slow
+def test_what_a_run_keeps_cannot_be_changed_in_its_file(finished: Path, launcher: Path, tmp_path: Path) -> None:
+    folder = Path(shutil.copytree(finished, tmp_path / "run"))
     config = OmegaConf.load(folder / "config.yaml")
     config.algo.gamma = 0.5
     OmegaConf.save(config, folder / "config.yaml")
@@ -237,6 +242,7 @@ def test_signals_save_and_tell_how_to_go_on(number: int, launcher: Path, tmp_pat
     assert verify(find_checkpoint(folder))["iteration"] >= 2
 
 
+@pytest.mark.slow
 def test_multirun(launcher: Path, tmp_path: Path) -> None:
     code, _, err = command(launcher, tmp_path, "--multirun", "algo.iterations=1", "logger=csv", "seed=0,1")
     assert code == 0, err
