@@ -1,8 +1,10 @@
-"""What must be set before torch is imported. This module imports nothing heavy."""
+"""What must be set before torch and dm_control are imported. This module imports nothing heavy."""
 
 from __future__ import annotations
 
+import logging
 import os
+import warnings
 
 
 def prepare_runtime() -> None:
@@ -10,6 +12,11 @@ def prepare_runtime() -> None:
 
     OpenMP's idle threads spin by default and starve the physics' threads of the same cores; these settings make them
     sleep. Values already in the environment win.
+
+    dm_control tries for a window on import; without a screen GLFW warns of it, and absl tells of each attempt. Neither
+    says anything about this project's own choice of an OpenGL backend, which comes later (:mod:`egopose.vision.gl`).
     """
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     os.environ.setdefault("GOMP_SPINCOUNT", "0")
+    warnings.filterwarnings("ignore", message=".*DISPLAY environment variable", module="glfw")
+    logging.getLogger("absl").setLevel(logging.WARNING)
