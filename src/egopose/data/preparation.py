@@ -13,6 +13,7 @@ import numpy as np
 import torch
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+from egopose.data.lock import store_lock
 from egopose.data.prepare_motion import PreparationSettings, reference_motion
 from egopose.data.reference import reference_states, supported
 from egopose.data.sources import TakeSource, find_sources
@@ -23,6 +24,10 @@ from egopose.humanoid.model import HumanoidModel, build_humanoid
 from egopose.motion.io import read_motion
 from egopose.motion.motion import Motion
 from egopose.motion.retarget import RetargetReport
+
+#: Raise it whenever changed code gives another reference, video or flow for unchanged settings and sources: reading of
+#: motion files, retargeting, settling, making of the humanoid, rendering, optical flow. Stores are then made anew.
+PREPARATION_VERSION = 1
 
 
 def humanoid_of(config: Mapping[str, Any]) -> HumanoidModel:
@@ -41,18 +46,20 @@ def store_folder(config: Mapping[str, Any]) -> Path:
 
 
 def fingerprint_of(config: Mapping[str, Any]) -> str:
-    """Changes with whatever changes the reference: sources, humanoid, preparation."""
+    """Changes with whatever changes the reference: sources, humanoid, preparation and its code's version."""
     data = config["data"]
     sources = [
         [s.name, s.subject, s.motion.stat().st_size, str(s.video), s.sync_offset, s.options, s.mapping]
         for s in find_sources(data)
     ]
     parts = [sources, config["humanoid"], data.get("preparation"), config["sim"]["control_hz"]]
+    if PREPARATION_VERSION != 1:  # stores of version 1 were made before versions were counted
+        parts.append(PREPARATION_VERSION)
     return hashlib.sha256(json.dumps(parts, sort_keys=True, default=str).encode()).hexdigest()
 
 
 def prepare(config: Mapping[str, Any], *, progress: bool = True, flow: bool = True) -> TakeStore:
-    """The store of a configuration, made or completed.
+    """The store of a configuration, made or completed; by one process at a time, the others wait.
 
     Args:
         config: resolved; groups ``data humanoid sim vision``.
@@ -63,11 +70,19 @@ def prepare(config: Mapping[str, Any], *, progress: bool = True, flow: bool = Tr
         InputError: a source cannot be used; nothing already made is lost.
     """
     root = store_folder(config)
+    with store_lock(root):
+        return _prepare(config, root, progress, flow)
+
+
+def _prepare(config: Mapping[str, Any], root: Path, progress: bool, flow: bool) -> TakeStore:
     if (root / "store.json").is_file():
         store = TakeStore.open(root)
         if store.fingerprint != fingerprint_of(config):
             raise InputError(
-                root, "fingerprint", "the store was made of other data or settings; give another data.store"
+                root,
+                "fingerprint",
+                "the store was made of other data or settings, or by another version of the preparation; "
+                "give another data.store",
             )
     else:
         store = _make_motions(config, root, progress)
