@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -12,13 +13,16 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from egopose.data.preparation import flow_name, humanoid_of, prepare
+from egopose.data.preparation import fingerprint_of, flow_name, humanoid_of, prepare
 from egopose.data.splits import split_takes
 from egopose.data.store import TakeInfo, TakeStore
 from egopose.envs.problem import TakeTable
 from egopose.envs.starts import FragmentLike
+from egopose.errors import InputError
 from egopose.humanoid.model import HumanoidModel
-from egopose.regression import regressor_tables
+from egopose.regression import kept_tables, regressor_tables
+
+PROVENANCE = "provenance.json"
 
 
 @dataclass(frozen=True)
@@ -35,6 +39,7 @@ class Material:
         joint_targets: ``[F, nu]`` rad of the state regressor, or None.
         states: ``[F, S]`` humanoid states of the state regressor, or None.
         regressor: folder of the state regressor's weights, or None.
+        store_fingerprint: of the store it all comes from, or None.
     """
 
     humanoid: HumanoidModel
@@ -47,11 +52,48 @@ class Material:
     joint_targets: Tensor | None = None
     states: Tensor | None = None
     regressor: Path | None = None
+    store_fingerprint: str | None = None
 
     def keep_regressor(self, folder: Path) -> None:
         """Copy the state regressor's weights to ``folder/regressor``, so that a run can be used without its store."""
         if self.regressor is not None and not (folder / "regressor").exists():
             shutil.copytree(self.regressor, folder / "regressor")
+
+    def keep_provenance(self, folder: Path) -> None:
+        """Note in ``folder/provenance.json`` which store a run is trained on.
+
+        Raises:
+            InputError: the run was begun on another store.
+        """
+        if self.store_fingerprint is None:
+            return
+        if (folder / PROVENANCE).is_file():
+            require_same_store(folder, self.store_fingerprint)
+            return
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / PROVENANCE).write_text(json.dumps({"store_fingerprint": self.store_fingerprint}, indent=1))
+
+
+def require_same_store(run: Path, fingerprint: str) -> None:
+    """A run may go on, or be judged, only on the data it was trained on. Runs that noted no store are let through.
+
+    Raises:
+        InputError: the run directory notes another fingerprint, or its note is damaged.
+    """
+    path = run / PROVENANCE
+    if not path.is_file():
+        return
+    try:
+        noted = json.loads(path.read_text())["store_fingerprint"]
+    except (ValueError, TypeError, KeyError) as error:
+        raise InputError(path, "store_fingerprint", f"is damaged: {error!r}") from None
+    if noted != fingerprint:
+        raise InputError(
+            path,
+            "store_fingerprint",
+            f"the run was trained on a store {str(noted)[:10]}, its configuration now gives {fingerprint[:10]}: "
+            "the source files or the version of the preparation have changed since",
+        )
 
 
 def take_table(takes: Sequence[TakeInfo]) -> TakeTable:
@@ -70,7 +112,30 @@ def load_material(config: Mapping[str, Any], progress: bool = True) -> Material:
         InputError: data cannot be found or used, the split leaves nothing, or a setting is wrong.
     """
     store = prepare(config, progress=progress)
-    tables, weights = regressor_tables(config, store, humanoid_of(config), flow_name(config))
+    return _with_tables(config, store, *regressor_tables(config, store, humanoid_of(config), flow_name(config)))
+
+
+def run_material(config: Mapping[str, Any], run: Path, same_store: bool = True, progress: bool = True) -> Material:
+    """The material of a trained run, seen by the run's own state regressor ``run/regressor``; nothing is trained.
+
+    Args:
+        config: the run's, resolved. Its data is prepared where that has not been done yet.
+        run: the run directory.
+        same_store: whether the data must be what the run was trained on; False for data of another set.
+        progress: show bars.
+
+    Raises:
+        InputError: as :func:`load_material`; the data is not the run's, or neither run nor store holds a regressor.
+    """
+    if same_store:
+        # Before anything is prepared: hours could pass, only to be refused.
+        require_same_store(run, fingerprint_of(config))
+    store = prepare(config, progress=progress)
+    tables = kept_tables(config, store, humanoid_of(config), flow_name(config), run / "regressor")
+    return _with_tables(config, store, *tables)
+
+
+def _with_tables(config: Mapping[str, Any], store: TakeStore, tables: TensorDictBase, weights: Path) -> Material:
     return replace(
         _motion_of(config, store),
         visual_features=tables["visual_features"],
@@ -78,6 +143,7 @@ def load_material(config: Mapping[str, Any], progress: bool = True) -> Material:
         joint_targets=tables["joint_targets"],
         states=tables["humanoid_state"],
         regressor=weights,
+        store_fingerprint=store.fingerprint,
     )
 
 

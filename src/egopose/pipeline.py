@@ -24,7 +24,7 @@ from egopose.envs.transforms import StateNormalizer, TrackingError, VisualContex
 from egopose.errors import InputError
 from egopose.evaluation.report import TakeVideo
 from egopose.evaluation.survival import frames_survived
-from egopose.material import Material, load_material, motion_material
+from egopose.material import Material, load_material, motion_material, run_material
 from egopose.models.policy import PolicySettings, build_actor, build_critic
 from egopose.training.checkpoint import RunCheckpoint, find_checkpoint, read_json, require, verify
 from egopose.training.collectors import CollectorSettings, build_collector, transform_state
@@ -41,9 +41,11 @@ __all__ = [
     "load_agent",
     "load_material",
     "motion_material",
+    "run_material",
     "take_videos",
 ]
 
+_STORE_GROUPS = {"data", "humanoid", "sim"}
 _LOOP_IN_ALGO = ("iterations", "steps_per_iteration")
 _LOOP_IN_TRAINING = ("total_steps", "max_seconds", "checkpoint_every", "keep_last", "evaluate_every")
 
@@ -150,6 +152,7 @@ def build_run(config: Mapping[str, Any], folder: Path, material: Material) -> Ru
     loop |= {name: training.get(name, ...) for name in _LOOP_IN_TRAINING}
     settings = LoopSettings.from_config(loop)
     material.keep_regressor(folder)
+    material.keep_provenance(folder)
     collector_settings = CollectorSettings.from_config(config["collector"])
     ppo_settings = PPOSettings.from_config(algo)
 
@@ -232,17 +235,20 @@ def load_agent(
 
     Args:
         path: a checkpoint folder or a run directory.
-        material: to run on; None for the one its configuration names.
+        material: to run on; None for the data its configuration names, seen by the run's own state regressor.
         which: of a run directory, the ``best`` or the ``latest`` checkpoint.
         overrides: whole config groups in place of the run's own (``{"data": {...}}``).
 
     Raises:
-        InputError: the checkpoint is damaged, or does not fit the material; names the field.
+        InputError: the checkpoint is damaged, or does not fit the material; the run was trained on other data, or its
+            state regressor is gone; names the field.
     """
     folder = find_checkpoint(path, which)
     metadata = verify(folder)
     config = {**read_json(folder, "config"), **(overrides or {})}
-    material = load_material(config) if material is None else material
+    if material is None:
+        same_store = _STORE_GROUPS.isdisjoint(overrides or {})
+        material = run_material(config, folder.resolve().parent.parent, same_store)
     env = build_env(config, material, worlds=1)
     require(metadata, folder, task=str(config["task"]["name"]), action_size=int(env.action_spec.shape[-1]))
     actor, critic = build_networks(config, material, env)

@@ -1,7 +1,8 @@
 """The state regressor F of a store: trained once for a configuration, its predictions kept as a table of the store.
 
 Two places hold what came of it: ``STORE/tables/NAME`` (predictions on every frame) and ``STORE/regressors/NAME`` (the
-weights, in the checkpoint format), NAME being a fingerprint of all that F depends on.
+weights, in the checkpoint format), NAME being a fingerprint of all that F depends on. While F is being trained,
+``STORE/regressors/NAME.part`` holds what it takes to go on after an interruption.
 """
 
 from __future__ import annotations
@@ -9,8 +10,10 @@ from __future__ import annotations
 import hashlib
 import json
 import math
+import shutil
 import sys
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +22,7 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from egopose.config import from_mapping
+from egopose.data.lock import store_lock
 from egopose.data.splits import split_takes
 from egopose.data.store import TakeStore
 from egopose.envs.mdp.observations import humanoid_state
@@ -26,11 +30,11 @@ from egopose.errors import InputError
 from egopose.humanoid.model import HumanoidModel
 from egopose.models.mirror import state_mirror
 from egopose.models.regressor import StateRegressor
-from egopose.training.checkpoint import RunCheckpoint, metadata_of, read_json
+from egopose.training.checkpoint import CHECKSUMS, ComponentState, RunCheckpoint, metadata_of, read_json, verify
 from egopose.training.fragments import Span
 from egopose.training.predictions import predict_takes
 from egopose.training.regressor_settings import RegressorSettings
-from egopose.training.supervised import Progress, build_regressor, train_regressor
+from egopose.training.supervised import Progress, State, build_regressor, train_regressor
 from egopose.vision.encoders import build_encoder
 
 TABLE_KEYS = ("humanoid_state", "visual_context", "visual_features", "joint_targets")
@@ -56,9 +60,70 @@ def regressor_tables(
     """
     name = regressor_name(config, store, flow_name)
     weights = store.root / "regressors" / name
-    if not (store.has_table(name) and (weights / "manifest.json").is_file()):
-        _train(config, store, humanoid, flow_name, name, weights)
+    if not _is_trained(store, name):
+        with store_lock(store.root):
+            if not _is_trained(store, name):  # by the process this one waited for
+                _train(config, store, humanoid, flow_name, name, weights)
     return store.table(name), weights
+
+
+def kept_tables(
+    config: Mapping[str, Any], store: TakeStore, humanoid: HumanoidModel, flow_name: str, weights: Path
+) -> tuple[TensorDict, Path]:
+    """As :func:`regressor_tables`, by the F a run was trained with: nothing is ever learned here.
+
+    A table of the store made by the very same weights is read; else F predicts anew, and the store is left as it is.
+
+    Args:
+        config: of the run, resolved.
+        store: with flow.
+        humanoid: of the run.
+        flow_name: the flow's name in the store.
+        weights: ``RUN_DIR/regressor``. Where there is none, the store's F for ``config`` is taken.
+
+    Raises:
+        InputError: neither the run nor the store holds an F, its weights are damaged, or the store lacks flow.
+    """
+    if not weights.is_dir():
+        name = regressor_name(config, store, flow_name)
+        if not _is_trained(store, name):
+            raise InputError(weights, "regressor", f"is missing, and the store {store.root} holds none of this run's")
+        return store.table(name), store.root / "regressors" / name
+    verify(weights)
+    wanted = _weights_checksums(weights)
+    for folder in sorted((store.root / "regressors").glob("*")):
+        name = folder.name
+        made_by_it = _is_trained(store, name) and _weights_checksums(folder) == wanted
+        if made_by_it and store.table_card(name).get("flow") == flow_name:
+            return store.table(name), weights
+    model, made_with = load_regressor(weights)
+    size = humanoid_state(store.reference[:1]).shape[1]
+    if made_with["state_size"] != size:
+        raise InputError(weights, "state_size", f"is {made_with['state_size']}, the store's states have {size} numbers")
+    print(f"predicting {store.frames_total} frames with {weights}", file=sys.stderr, flush=True)
+    return TensorDict(_predict(model, store, humanoid, flow_name, _settings(made_with)), [store.frames_total]), weights
+
+
+def _is_trained(store: TakeStore, name: str) -> bool:
+    return store.has_table(name) and (store.root / "regressors" / name / "manifest.json").is_file()
+
+
+def _weights_checksums(folder: Path) -> dict[str, str]:
+    """Of the tensors and the settings they belong to; the manifest beside them also tells when they were saved."""
+    try:
+        found = json.loads((folder / CHECKSUMS).read_text())
+    except (OSError, ValueError) as error:
+        raise InputError(folder, CHECKSUMS, f"cannot be read: {error}") from None
+    return {file: digest for file, digest in found.items() if file.startswith("components/")}
+
+
+def _predict(
+    model: StateRegressor, store: TakeStore, humanoid: HumanoidModel, flow_name: str, settings: RegressorSettings
+) -> dict[str, Tensor]:
+    whole = [Span(t.offset, t.offset + t.length) for t in store.takes]
+    tables = predict_takes(model, store.flow(flow_name), whole, settings)
+    tables["joint_targets"] = joint_targets(tables["humanoid_state"], humanoid)
+    return {key: tables[key] for key in TABLE_KEYS}
 
 
 def _train(
@@ -78,10 +143,12 @@ def _train(
     mirror = state_mirror(humanoid.skeleton) if settings.mirror else None
     frames = sum(f.stop - f.start for f in fragments)
     print(f"training the state regressor on {frames} frames", file=sys.stderr, flush=True)
-    result = train_regressor(model, flow, states, fragments, settings, mirror, _report)
-    whole = [Span(t.offset, t.offset + t.length) for t in store.takes]
-    tables = predict_takes(model, flow, whole, settings)
-    tables["joint_targets"] = joint_targets(tables["humanoid_state"], humanoid)
+    part = weights.with_name(weights.name + ".part")
+    weights.parent.mkdir(parents=True, exist_ok=True)
+    result = train_regressor(
+        model, flow, states, fragments, settings, mirror, _report, partial(_save_part, part), _load_part(part)
+    )
+    tables = _predict(model, store, humanoid, flow_name, settings)
     # JSON knows no NaN: nothing was held out, nothing is known.
     errors = {
         key: None if math.isnan(value) else value
@@ -89,11 +156,29 @@ def _train(
     }
     card = {"flow": flow_name, "best_epoch": result.best_epoch, **errors}
     sizes = {"state_size": states.shape[1], "vision": config["vision"], "regressor": config["regressor"]}
-    weights.parent.mkdir(parents=True, exist_ok=True)
+    # Never weights beside a table that others made.
+    shutil.rmtree(store.root / "tables" / name, ignore_errors=True)
     RunCheckpoint({"regressor": model, "config": sizes}).save(
         weights, metadata=metadata_of("regressor", states.shape[1], result.best_epoch, 0, 0.0)
     )
-    store.write_table(name, {key: tables[key] for key in TABLE_KEYS}, card)
+    store.write_table(name, tables, card)
+    shutil.rmtree(part, ignore_errors=True)
+
+
+def _save_part(part: Path, state: State) -> None:
+    component = ComponentState(lambda: state, lambda _: None)
+    epoch = int(state["counters"][0])
+    RunCheckpoint({"training": component}).save(part, metadata=metadata_of("regressor training", 0, epoch, 0, 0.0))
+
+
+def _load_part(part: Path) -> State | None:
+    """What :func:`_save_part` left, None where training starts anew. Raises InputError where it is damaged."""
+    if not part.is_dir():
+        return None
+    state: State = {}
+    found = RunCheckpoint({"training": ComponentState(dict, state.update)}).restore(part)
+    print(f"going on after epoch {found['iteration']}, saved in {part}", file=sys.stderr, flush=True)
+    return state
 
 
 def _settings(config: Mapping[str, Any]) -> RegressorSettings:
