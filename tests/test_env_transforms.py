@@ -1,4 +1,4 @@
-"""Visual context and the running normaliser against NumPy, in and out of an environment."""
+"""Visual context, tracking error and the running normaliser against NumPy, in and out of an environment."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from tensordict import TensorDict
 from torchrl.envs import Compose, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
-from egopose.envs.transforms import StateNormalizer, VisualContext
+from egopose.envs.transforms import StateNormalizer, TrackingError, VisualContext
 
 ROWS = arrays(np.float64, st.tuples(st.integers(1, 12), st.just(3)), elements=st.floats(-1e4, 1e4, width=32))
 
@@ -138,3 +138,84 @@ def test_state_round_trip_to_the_bit() -> None:
     count = restored.count.item()
     restored(TensorDict({"humanoid_state": values}, batch_size=[5]))
     assert restored.count.item() == count
+
+
+# --- the tracking error --------------------------------------------------------------------------------------------
+
+STATES = torch.tensor([[1.0, 10.0], [2.0, 10.0], [4.0, 13.0]])
+SCALE = torch.tensor([0.5, 2.0])
+
+
+def error_of(state: list[list[float]], frame: list[int], clip: float = 5.0) -> list[list[float]]:
+    td = TensorDict({"humanoid_state": torch.tensor(state), "frame": torch.tensor(frame)[:, None]}, [len(frame)])
+    return TrackingError(STATES, SCALE, clip)(td)["tracking_error"].tolist()
+
+
+def test_tracking_error_by_hand() -> None:
+    """(state - table[frame]) / scale, then (table[frame + 1] - table[frame]) / scale."""
+    assert error_of([[1.5, 8.0], [2.0, 11.0]], [0, 1]) == [[1.0, -1.0, 2.0, 0.0], [0.0, 0.5, 4.0, 1.5]]
+
+
+def test_after_the_last_frame_the_regressor_stands_still() -> None:
+    assert error_of([[4.0, 14.0]], [2]) == [[0.0, 0.5, 0.0, 0.0]]
+
+
+def test_tracking_error_is_clipped_on_both_sides() -> None:
+    assert error_of([[100.0, -100.0]], [1]) == [[5.0, -5.0, 4.0, 1.5]]
+    assert error_of([[100.0, -100.0]], [1], clip=3.0) == [[3.0, -3.0, 3.0, 1.5]]
+
+
+def tracking_env(n: int = 4) -> tuple[TransformedEnv, TrackingError, list[torch.Tensor]]:
+    """In the order of training, with a list of the raw states the base environment hands out."""
+    env = environment(n, problem=problem(termination={"enabled": False, "head_drop": 0.1}))
+    size = env.observation_spec["humanoid_state"].shape[-1]
+    generator = torch.Generator().manual_seed(1)
+    table = torch.randn(env.problem.n_frames, size, generator=generator)
+    tracking = TrackingError(table, 0.5 + torch.rand(size, generator=generator))
+    raw: list[torch.Tensor] = []
+    original = env.problem.observation
+
+    def spy(state: TensorDict) -> torch.Tensor:
+        raw.append(original(state).float())
+        return raw[-1]
+
+    env.problem.observation = spy
+    return TransformedEnv(env, Compose(tracking, StateNormalizer(size))), tracking, raw
+
+
+def numpy_error(tracking: TrackingError, state: torch.Tensor, frame: torch.Tensor) -> np.ndarray:
+    table, scale, rows = tracking.table.numpy(), tracking.scale.numpy(), frame.squeeze(-1).numpy()
+    now, ahead = table[rows], table[np.minimum(rows + 1, len(table) - 1)]
+    return np.clip(np.concatenate([(state.numpy() - now) / scale, (ahead - now) / scale], axis=-1), -5, 5)
+
+
+def test_an_environment_with_tracking_error_keeps_its_specs() -> None:
+    env, tracking, _ = tracking_env()
+    check_env_specs(env)
+    assert env.observation_spec["tracking_error"].shape == (4, 2 * tracking.table.shape[-1])
+
+
+def test_tracking_error_is_that_of_the_raw_state() -> None:
+    """The normaliser stands after it, and at the first reset would have made zeros of the state."""
+    env, tracking, raw = tracking_env()
+    raw.clear()
+    td = env.reset()
+    np.testing.assert_allclose(td["tracking_error"], numpy_error(tracking, raw[0], td["frame"]), rtol=1e-5, atol=1e-5)
+    assert not torch.allclose(td["humanoid_state"], raw[0])
+    td = env.step(td.set("action", torch.zeros(env.action_spec.shape)))["next"]
+    np.testing.assert_allclose(td["tracking_error"], numpy_error(tracking, raw[1], td["frame"]), rtol=1e-5, atol=1e-5)
+
+
+def test_reset_worlds_see_their_new_start_and_the_others_what_they_saw() -> None:
+    env, tracking, raw = tracking_env()
+    td = env.reset()
+    for _ in range(3):
+        td = env.step(td.set("action", torch.zeros(env.action_spec.shape)))["next"]
+    before = td["tracking_error"].clone()
+    raw.clear()
+    again = env.reset(td.set("_reset", torch.tensor([[True], [False], [True], [False]])))
+    expected = numpy_error(tracking, raw[-1], again["frame"])
+    fresh = [0, 2]
+    np.testing.assert_allclose(again["tracking_error"][fresh], expected[fresh], rtol=1e-5, atol=1e-5)
+    assert not torch.equal(again["tracking_error"][fresh], before[fresh])
+    assert torch.equal(again["tracking_error"][[1, 3]], before[[1, 3]])
