@@ -12,6 +12,7 @@ from tensordict import TensorDict
 from egopose.envs.problem import TakeTable
 from egopose.motion import rotations as rot
 from egopose.motion.motion import finite_difference
+from egopose.motion.skeleton import Dof, Joint, Skeleton
 
 _JOINTS = {
     # name: (parent, offset, axes)
@@ -30,10 +31,11 @@ _AXIS = {"x": "1 0 0", "y": "0 1 0", "z": "0 0 1"}
 
 @dataclass(frozen=True)
 class StandIn:
-    """The attributes of ``HumanoidModel`` that the environment reads."""
+    """The attributes of ``HumanoidModel`` that environment and networks read."""
 
     xml: str
     mj_model: mujoco.MjModel
+    skeleton: Skeleton
     body_ids: np.ndarray
     joint_parent: np.ndarray
     kp: np.ndarray
@@ -60,6 +62,19 @@ def _body(name: str) -> str:
     return f'<body name="{name}" pos="{pos}">{root}{joints}{geom}{children}</body>'
 
 
+def _skeleton() -> Skeleton:
+    names = list(_JOINTS)
+    axes = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
+    return Skeleton(
+        tuple(
+            Joint(
+                name, -1 if parent is None else names.index(parent), offset, tuple(Dof("hinge", axes[a]) for a in dofs)
+            )
+            for name, (parent, offset, dofs) in _JOINTS.items()
+        )
+    )
+
+
 def stand_in(substeps: int = 5) -> StandIn:
     names = [f"{n}_{a}" for n, (_, _, axes) in _JOINTS.items() for a in axes]
     kp, kd = 200.0, 20.0
@@ -79,6 +94,7 @@ def stand_in(substeps: int = 5) -> StandIn:
     return StandIn(
         xml=xml,
         mj_model=model,
+        skeleton=_skeleton(),
         body_ids=ids,
         joint_parent=model.body_parentid[ids[1:]] - 1,
         kp=np.full(model.nu, kp),

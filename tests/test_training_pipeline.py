@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,9 +16,11 @@ from torchrl.render import load_checkpoint
 from toy_problem import COLLECTOR, LOOP, SETTINGS
 
 from egopose import pipeline
-from egopose.envs.transforms import StateNormalizer
+from egopose.envs.mdp.observations import humanoid_state
+from egopose.envs.transforms import StateNormalizer, TrackingError, VisualContext
 from egopose.errors import InputError
 from egopose.material import Material
+from egopose.models.feedback import BalanceFeedback
 from egopose.training.checkpoint import compare_states
 from egopose.training.loop import train
 
@@ -37,7 +40,12 @@ def material() -> Material:
         visual_features=torch.randn(frames, 6, generator=generator),
         visual_context=torch.randn(frames, 5, generator=generator),
         joint_targets=reference["qpos"][:, 7:].float(),
+        states=humanoid_state(reference).float(),
     )
+
+
+#: The stand-in's hinges turn about z, y, x.
+FEEDBACK = {"pitch": [["RightFoot_1", "LeftFoot_1"], ["Spine_1"]], "roll": [["RightFoot_2", "LeftFoot_2"]]}
 
 
 def configuration(context: str = "frozen", **training: Any) -> dict[str, Any]:
@@ -47,7 +55,12 @@ def configuration(context: str = "frozen", **training: Any) -> dict[str, Any]:
         "seed": 5,
         "task": {**group("task", "residual"), "horizon": 12, "minimum": 6},
         "reward": group("reward", "estimation"),
-        "model": {**model, "hidden": [8], "context": {**model["context"], "source": context, "hidden_size": 4}},
+        "model": {
+            **model,
+            "hidden": [8],
+            "feedback": {**model["feedback"], **FEEDBACK},
+            "context": {**model["context"], "source": context, "hidden_size": 4},
+        },
         "algo": {**SETTINGS, "minibatch_size": 16, **{k: loop.pop(k) for k in ("iterations", "steps_per_iteration")}},
         "collector": {**COLLECTOR, "worlds": 4},
         "training": {**loop, "evaluation_worlds": 2, "evaluation_seed": 1},
@@ -101,7 +114,7 @@ def test_an_agent_is_what_was_trained(trained: Path, material: Material) -> None
 
 def test_an_agent_for_other_features_is_refused(trained: Path, material: Material) -> None:
     wider = Material(**{**vars(material), "visual_context": torch.zeros(material.reference.shape[0], 7)})
-    with pytest.raises(InputError, match=r"critic\..*has shape \[300, 56\] where \[300, 58\]"):
+    with pytest.raises(InputError, match=r"critic\..*has shape \[300, 158\] where \[300, 160\]"):
         pipeline.load_agent(trained, wider, which="latest")
 
 
@@ -113,6 +126,53 @@ def test_torchrl_evaluator_runs_it(trained: Path, material: Material) -> None:
     finally:
         evaluator.shutdown()
     assert 0 < float(result["eval/reward"]) <= 12
+
+
+def test_what_a_policy_sees_is_built_in_order(material: Material) -> None:
+    """The context and the tracking error of the raw state, which the normaliser changes last."""
+    env = pipeline.build_env(configuration(), material, worlds=2)
+    kinds = [type(t) for t in env.transform]
+    assert set(kinds) == {TrackingError, VisualContext, StateNormalizer}
+    assert kinds[-1] is StateNormalizer
+    (tracking,) = (t for t in env.transform if isinstance(t, TrackingError))
+    assert material.states is not None
+    assert torch.equal(tracking.table, material.states)
+    # PIECES: frames 0-39 of the first take (at 0), 5-24 of the second (at 40).
+    seen = torch.cat([material.states[0:40], material.states[45:65]])
+    torch.testing.assert_close(tracking.scale, seen.std(dim=0).clamp_min(0.05))
+    assert (tracking.scale == 0.05).any()
+    assert (tracking.scale > 0.05).any()
+
+
+def test_starts_on_a_perfect_regressors_states_show_no_error(material: Material) -> None:
+    """Here the regressor's states are the reference's, where episodes start."""
+    env = pipeline.build_env(configuration(), material, worlds=4)
+    td = env.reset()
+    size = env.observation_spec["humanoid_state"].shape[-1]
+    assert td["tracking_error"].shape == (4, 2 * size)
+    torch.testing.assert_close(td["tracking_error"][:, :size], torch.zeros(4, size), atol=1e-4, rtol=0.0)
+    assert td["tracking_error"][:, size:].abs().max() > 1e-2
+
+
+def test_training_moves_the_gains(trained: Path, material: Material) -> None:
+    agent = pipeline.load_agent(trained, material, which="latest")
+    (feedback,) = (m for m in agent.actor.modules() if isinstance(m, BalanceFeedback))
+    assert feedback.gains.shape == (3, 3)
+    assert (feedback.gains != 0).all()
+
+
+def test_a_tracking_error_needs_the_regressors_states(material: Material) -> None:
+    with pytest.raises(InputError, match="trained state regressor") as caught:
+        pipeline.build_env(configuration(), replace(material, states=None), worlds=1)
+    assert caught.value.field == "model.inputs"
+
+
+def test_feedback_for_another_body_is_refused(material: Material, tmp_path: Path) -> None:
+    config = configuration()
+    config["model"]["feedback"] = {**config["model"]["feedback"], "roll": [["Tail_0"]]}
+    with pytest.raises(InputError, match="Tail_0") as caught:
+        pipeline.build_run(config, tmp_path, material)
+    assert caught.value.field == "feedback.roll"
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="starts processes")
