@@ -110,19 +110,18 @@ def build_env(
     if "tracking_error" in config["model"]["inputs"]:
         if material.states is None:
             raise InputError("configuration", "model.inputs", "tracking_error needs a trained state regressor")
-        transforms.insert(0, TrackingError(material.states, _state_scale(material)))
+        transforms.insert(
+            0, TrackingError(material.states, _state_scale(material, float(config["regressor"]["std_floor"])))
+        )
     return TransformedEnv(base, Compose(*transforms))
 
 
-def _state_scale(material: Material) -> torch.Tensor:
+def _state_scale(material: Material, floor: float) -> torch.Tensor:
     """``[S]``: deviation of the regressor's states on the training frames, floored for still numbers."""
     assert material.states is not None
     offsets = material.takes.offsets
     rows = [material.states[int(offsets[f.take]) + f.start : int(offsets[f.take]) + f.stop] for f in material.train]
-    return torch.cat(rows).std(dim=0).clamp_min(_STATE_SCALE_FLOOR)
-
-
-_STATE_SCALE_FLOOR = 0.05  # m, rad, m/s, rad/s
+    return torch.cat(rows).std(dim=0).clamp_min(floor)
 
 
 def build_networks(

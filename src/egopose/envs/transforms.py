@@ -51,9 +51,13 @@ class TrackingError(Transform):
         key: of what it writes, ``[..., 2 S]``: the scaled error, the regressor's scaled step to the next frame.
     """
 
+    scale: Tensor
+
     def __init__(self, table: Tensor, scale: Tensor, clip: float = 5.0, key: str = "tracking_error") -> None:
         super().__init__(in_keys=["humanoid_state", "frame"], out_keys=[key])
-        self.table, self.scale, self.clip = table, scale, clip
+        self.table, self.clip = table, clip
+        # A buffer: a policy must see other data in the units it was trained in.
+        self.register_buffer("scale", scale)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Writes :attr:`out_keys` from the raw ``humanoid_state`` and ``frame``."""

@@ -63,6 +63,8 @@ class BalanceFeedback(nn.Module):
                     row[list(dof_names).index(name)] = 1.0
                 basis.append(row)
                 owners.append(plane)
+        if not basis:
+            raise InputError("model", "feedback", "names no hinges; null is for none")
         linear, angular = 5 + size, 8 + size
         columns = [[q, angular + w, linear + v] for q, w, v in (_PLANES[plane] for plane in owners)]
         self.register_buffer("basis", torch.stack(basis))
