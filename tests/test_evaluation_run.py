@@ -62,6 +62,7 @@ def agent() -> pipeline.Agent:
         "seed": 5,
         "task": {**group("task", "residual"), "horizon": 12, "minimum": 6},
         "reward": group("reward", "estimation"),
+        "regressor": {"std_floor": 0.05},
         "model": {**group("model", "fast"), "hidden": [8]},
     }
     actor, critic = pipeline.build_networks(config, material, pipeline.build_env(config, material, worlds=1))

@@ -55,6 +55,7 @@ def configuration(context: str = "frozen", **training: Any) -> dict[str, Any]:
         "seed": 5,
         "task": {**group("task", "residual"), "horizon": 12, "minimum": 6},
         "reward": group("reward", "estimation"),
+        "regressor": {"std_floor": 0.05},
         "model": {
             **model,
             "hidden": [8],
