@@ -37,6 +37,7 @@ def walk() -> Motion:
 def stable_pd(humanoid: HumanoidModel, qpos: np.ndarray, qvel: np.ndarray, targets: np.ndarray) -> np.ndarray:
     """Joint angles ``[steps, 52]`` after each control step under reference stable PD on the same body."""
     model = mujoco.MjModel.from_xml_string(humanoid.xml)
+    model.jnt_actfrclimited[:] = 0  # the limit is applied to the applied force below
     model.opt.integrator = mujoco.mjtIntegrator.mjINT_EULER
     model.actuator_gainprm[:] = 0.0
     model.actuator_biasprm[:] = 0.0
@@ -73,12 +74,32 @@ def implicit_pd(humanoid: HumanoidModel, qpos: np.ndarray, qvel: np.ndarray, tar
     return np.array(out)
 
 
+def unlimited(humanoid: HumanoidModel) -> HumanoidModel:
+    """The same body without torque limits."""
+    model = mujoco.MjModel.from_xml_string(humanoid.xml)
+    model.jnt_actfrclimited[:] = 0
+    return replace(humanoid, mj_model=model, torque_limit=np.full_like(humanoid.torque_limit, np.inf))
+
+
+@pytest.mark.parametrize("start", [0, 20, 40])
+def test_stays_near_where_a_torque_limit_holds(walk: Motion, start: int) -> None:
+    """At start 0 a knee saturates: MuJoCo keeps its implicit damping there, stable PD as published clips the sum."""
+    humanoid = default_humanoid()
+    qvel = finite_difference(walk.qpos, walk.fps)
+    frames = np.arange(start + 1, start + 16)
+    targets = walk.qpos[frames, 7:] + 0.06 * qvel[frames, 6:]
+    qpos = walk.qpos[start].copy()
+    qpos[2] += 5.0
+    native, reference = (track(humanoid, qpos, qvel[start], targets) for track in (implicit_pd, stable_pd))
+    assert np.abs(native - reference).max() < 0.001
+
+
 @pytest.mark.parametrize("start", [0, 20, 40])
 @pytest.mark.parametrize(("lift", "largest", "mean"), [(5.0, 0.0005, 0.00005), (0.0, 0.1, 0.006)], ids=["air", "floor"])
 def test_tracks_a_walk_as_reference_stable_pd_does(
     walk: Motion, start: int, lift: float, largest: float, mean: float
 ) -> None:
-    humanoid = default_humanoid()
+    humanoid = unlimited(default_humanoid())
     qvel = finite_difference(walk.qpos, walk.fps)
     frames = np.arange(start + 1, start + 16)
     targets = walk.qpos[frames, 7:] + 0.06 * qvel[frames, 6:]

@@ -42,7 +42,7 @@ def run_training(config: dict[str, Any], folder: Path, checkpoint: Path | None =
     from egopose.training.loop import train
 
     write_provenance(folder, config)
-    material = pipeline.load_material(config)
+    material = pipeline.load_material(config) if checkpoint is None else pipeline.run_material(config, folder)
     run = pipeline.build_run(config, folder, material)
     if checkpoint is not None:
         run.restore(checkpoint)

@@ -59,7 +59,7 @@ def build_collector(
 
     ``make_env`` gets the worker's number, to seed by.
 
-    ``track_traj_ids=False`` and ``device=None`` because they are the quickest (docs/performance.md).
+    ``track_traj_ids=False`` and ``device=None`` because they are the quickest (measured; see docs/howto-bench.md).
     """
     if settings.kind == "sync":
         return Collector(
