@@ -10,7 +10,7 @@ from __future__ import annotations
 import argparse
 import csv
 import json
-import shutil
+import re
 from pathlib import Path
 
 import matplotlib
@@ -30,11 +30,12 @@ python experiments/first_estimation/table.py --run runs/first/RUN"""
 def collect(run: Path) -> None:
     """Copy the raw results out of a run directory."""
     RAW.mkdir(exist_ok=True)
-    for path in (run / "curves.csv", run / "config.yaml", run / "versions.json", run / "git.json"):
-        if path.is_file():
-            shutil.copy(path, RAW / path.name)
-    for name in ("results.json", "takes.csv"):
-        shutil.copy(run / "evaluation" / "test" / name, RAW / name)
+    here = str(run.resolve().parents[1]) + "/"
+    names = ("curves.csv", "config.yaml", "versions.json", "git.json")
+    for path in (*(run / n for n in names), *(run / "evaluation" / "test" / n for n in ("results.json", "takes.csv"))):
+        # Paths of the machine it ran on say nothing to anybody else.
+        text = re.sub(r"(folder: ).*/(cmu_bvh60)", r"\1PATH/\2", path.read_text().replace(here, ""))
+        (RAW / path.name).write_text(text)
 
 
 def ratio_table(results: dict) -> list[str]:
