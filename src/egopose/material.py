@@ -16,6 +16,7 @@ from torch import Tensor
 from egopose.data.preparation import fingerprint_of, flow_name, humanoid_of, prepare
 from egopose.data.splits import split_takes
 from egopose.data.store import TakeInfo, TakeStore
+from egopose.envs.mdp.observations import humanoid_state
 from egopose.envs.problem import TakeTable
 from egopose.envs.starts import FragmentLike
 from egopose.errors import InputError
@@ -148,7 +149,7 @@ def _with_tables(config: Mapping[str, Any], store: TakeStore, tables: TensorDict
 
 
 def motion_material(config: Mapping[str, Any], context_size: int = 128) -> Material:
-    """For measuring speed without any video: noise for context, the reference's own joint angles for joint targets.
+    """For measuring speed without any video: noise for context, the reference's own states and joint angles.
 
     Raises:
         InputError: as :func:`load_material`.
@@ -156,7 +157,11 @@ def motion_material(config: Mapping[str, Any], context_size: int = 128) -> Mater
     motion = _motion_of(config, prepare(config, progress=False, flow=False))
     noise = torch.randn(len(motion.reference), context_size, generator=torch.Generator().manual_seed(0))
     return replace(
-        motion, visual_features=noise, visual_context=noise, joint_targets=motion.reference["qpos"][:, 7:].float()
+        motion,
+        visual_features=noise,
+        visual_context=noise,
+        joint_targets=motion.reference["qpos"][:, 7:].float(),
+        states=humanoid_state(motion.reference).float(),
     )
 
 
