@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import shutil
 import tarfile
 from functools import lru_cache
+from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
@@ -33,6 +35,27 @@ def default_config() -> HumanoidConfig:
 def default_humanoid(substeps: int = 15) -> HumanoidModel:
     """The default humanoid at 30 Hz control."""
     return build_humanoid(default_config(), SimConfig(substeps=substeps))
+
+
+#: Two short clips among those that ship with the package.
+SHORT_CLIPS = ("deepmimic_turn_left0", "deepmimic_walk")
+
+
+def short_clips(folder: Path) -> list[str]:
+    """Two short embedded clips as a set of one's own below ``folder``; the overrides that name it and its store."""
+    source = folder / "mocap"
+    if not source.is_dir():
+        source.mkdir(parents=True)
+        for name in SHORT_CLIPS:
+            shutil.copy(Path(str(files("egopose") / "assets" / "clips")) / f"{name}.motion.npz", source)
+    return [
+        "data=cmu6",
+        f"data.folder={source}",
+        "data.pattern='*.motion.npz'",
+        "data.subject='deepmimic_([a-z]+)'",
+        f"data.store={folder / 'store'}",
+        "sim=fast",
+    ]
 
 
 def rig_motion(rig: str, shared: Path, folder: Path, seconds: float = 6.0) -> Motion:

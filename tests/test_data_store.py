@@ -15,6 +15,7 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
+from mocap import SHORT_CLIPS, short_clips
 
 from egopose.config import compose_config
 from egopose.data import preparation
@@ -29,25 +30,14 @@ from egopose.motion.motion import finite_difference
 from egopose.vision.video import VideoWriter
 
 CLIPS = Path(str(files("egopose") / "assets" / "clips"))
-NAMES = ("deepmimic_turn_left0", "deepmimic_walk")
 
 
 def configuration(folder: Path, *overrides: str) -> dict[str, Any]:
     """Two short embedded clips as a folder of one's own, the quick simulation, a small flow."""
-    source = folder / "mocap"
-    if not source.is_dir():
-        source.mkdir(parents=True)
-        for name in NAMES:
-            shutil.copy(CLIPS / f"{name}.motion.npz", source)
     return compose_config(
         "prepare",
         [
-            "data=cmu6",
-            f"data.folder={source}",
-            "data.pattern='*.motion.npz'",
-            "data.subject='deepmimic_([a-z]+)'",
-            f"data.store={folder / 'store'}",
-            "sim=fast",
+            *short_clips(folder),
             *overrides,
         ],
     )
@@ -72,7 +62,7 @@ def store(made: Path, tmp_path: Path) -> TakeStore:
 
 
 def test_a_store_holds_the_clips_and_mujocos_kinematics_of_them(store: TakeStore, made: Path) -> None:
-    assert [t.name for t in store.takes] == list(NAMES)
+    assert [t.name for t in store.takes] == list(SHORT_CLIPS)
     assert [t.subject for t in store.takes] == ["turn", "walk"]
     assert store.fps == 30.0
     reference = store.reference
@@ -100,7 +90,7 @@ def test_a_store_holds_the_clips_and_mujocos_kinematics_of_them(store: TakeStore
         assert torch.allclose(velocity[:-1], (com[1:] - com[:-1]) * 30.0)
     assert store.takes[1].offset == store.takes[0].length
     report = store_report(store)
-    assert all(name in report for name in NAMES)
+    assert all(name in report for name in SHORT_CLIPS)
     assert "2 takes" in report
     assert not list((made / "store").parent.glob("*.part"))
 
@@ -174,7 +164,7 @@ def test_a_failed_table_leaves_the_old_one(store: TakeStore, monkeypatch: pytest
 def own(tmp_path: Path) -> dict[str, Any]:
     """A configuration of two takes with videos of one's own: 48 x 48 noise that slides, 30 fps."""
     rows = []
-    for number, name in enumerate(NAMES):
+    for number, name in enumerate(SHORT_CLIPS):
         video = tmp_path / f"{name}.mp4"
         texture = np.random.default_rng(number).integers(0, 255, (96, 96, 3), dtype=np.uint8)
         texture = np.repeat(np.repeat(texture[::8, ::8], 8, axis=0), 8, axis=1)
@@ -214,7 +204,9 @@ def test_own_videos_are_taken_as_they_are_and_resumed_take_by_take(
         store.flow(name)
     first = store.open_flow(name, 1)[store.frames(0)].clone()
     store = prepare(own, progress=False)
-    assert [p.name for p in calls] == [f"{n}.mp4" for n in (*NAMES, NAMES[1])]  # the first take was not done again
+    assert [p.name for p in calls] == [
+        f"{n}.mp4" for n in (*SHORT_CLIPS, SHORT_CLIPS[1])
+    ]  # the first take was not done again
     flow = store.flow(name)
     size = own["vision"]["flow"]["stored_size"]
     assert flow.shape == (store.frames_total, 2, size, size)

@@ -10,12 +10,12 @@ import shutil
 import subprocess
 import sys
 import time
-from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
+from mocap import short_clips
 
 from egopose import material, pipeline, regression
 from egopose.config import compose_config
@@ -28,28 +28,15 @@ from egopose.regression import kept_tables, load_regressor, regressor_name, regr
 from egopose.training.checkpoint import find_checkpoint
 from egopose.training.loop import train
 
-CLIPS = Path(str(files("egopose") / "assets" / "clips"))
-NAMES = ("deepmimic_turn_left0", "deepmimic_walk")
-
 
 def configuration(folder: Path) -> dict[str, Any]:
     """Two short embedded clips, the quick simulation, a small flow and small networks."""
-    source = folder / "mocap"
-    if not source.is_dir():
-        source.mkdir(parents=True)
-        for name in NAMES:
-            shutil.copy(CLIPS / f"{name}.motion.npz", source)
     return compose_config(
         "train",
         [
-            "data=cmu6",
-            f"data.folder={source}",
-            "data.pattern='*.motion.npz'",
-            "data.subject='deepmimic_([a-z]+)'",
-            f"data.store={folder / 'store'}",
+            *short_clips(folder),
             "data.split.train_share=0.5",
             "data.split.shortest=8",
-            "sim=fast",
             "vision.flow.stored_size=8",
             "vision.encoder.input_size=8",
             "vision.encoder.features=6",

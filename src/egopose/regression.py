@@ -23,6 +23,7 @@ from torch import Tensor
 
 from egopose.config import from_mapping
 from egopose.data.lock import store_lock
+from egopose.data.preparation import global_spans
 from egopose.data.splits import split_takes
 from egopose.data.store import TakeStore
 from egopose.envs.mdp.observations import humanoid_state
@@ -132,10 +133,8 @@ def _train(
     settings = _settings(config)
     flow = store.flow(flow_name)
     states = humanoid_state(store.reference).float()
-    fragments = [
-        Span(store.takes[f.take].offset + f.start, store.takes[f.take].offset + f.stop)
-        for f in split_takes(store.takes, config["data"]["split"], "train", supported_only=False)
-    ]
+    pieces = split_takes(store.takes, config["data"]["split"], "train", supported_only=False)
+    fragments = [Span(*span) for span in global_spans(store, pieces)]
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(settings.seed)
         encoder = build_encoder(config["vision"]["encoder"])

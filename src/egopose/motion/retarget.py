@@ -9,7 +9,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -91,7 +91,6 @@ class RetargetReport:
     unmapped: tuple[str, ...]
     scale: float
     ground_shift_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    notes: tuple[str, ...] = field(default=())
 
     def table(self) -> str:
         """The report as text, worst joints first."""
@@ -105,7 +104,7 @@ class RetargetReport:
         if self.at_limit:
             lines.append("at a limit: " + ", ".join(f"{k} {v:.0%}" for k, v in self.at_limit.items()))
         lines.append("dropped bones: " + (", ".join(self.unmapped) or "none"))
-        return "\n".join([*lines, *self.notes])
+        return "\n".join(lines)
 
 
 def retarget(
