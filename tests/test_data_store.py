@@ -274,7 +274,7 @@ def test_a_damaged_card_is_named(store: TakeStore, damage: Any, message: str) ->
 def test_a_cut_off_card_is_named(store: TakeStore) -> None:
     path, _ = card(store)
     path.write_text(path.read_text()[:100])
-    with pytest.raises(InputError, match=r"store\.json: takes: cannot be read"):
+    with pytest.raises(InputError, match=r"store\.json: takes: is damaged"):
         TakeStore.open(store.root)
 
 

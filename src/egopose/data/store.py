@@ -28,6 +28,7 @@ from torch import Tensor
 from egopose.errors import InputError
 from egopose.motion.io import read_motion, write_motion
 from egopose.motion.motion import Motion
+from egopose.untrusted import load_tensors, read_json
 
 SCHEMA = 1
 #: What every frame of ``reference/`` has; see :func:`egopose.data.reference.reference_states`.
@@ -88,7 +89,7 @@ class TakeStore:
                 root, "store.json", "is missing: this is not a take store; make one: python -m egopose.prepare"
             )
         try:
-            self.card: dict[str, Any] = json.loads(path.read_text())
+            self.card: dict[str, Any] = read_json(path, "takes")
             schema = self.card["schema"]
             if schema != SCHEMA:
                 raise InputError(path, "schema", f"is {schema}, this version reads {SCHEMA}; prepare the data again")
@@ -184,7 +185,7 @@ class TakeStore:
     def flow_done(self, name: str) -> set[int]:
         """Takes whose flow is in."""
         path = self.root / "flow" / name / "done.json"
-        return {int(i) for i in _read_json(path, "done")} if path.is_file() else set()
+        return {int(i) for i in read_json(path, "done")} if path.is_file() else set()
 
     def open_flow(self, name: str, size: int) -> Tensor:
         """The flow table to be filled; made on first use."""
@@ -219,7 +220,7 @@ class TakeStore:
         path = self.root / "tables" / name / "card.json"
         if not path.is_file():
             raise InputError(self.root, f"tables/{name}", "is missing")
-        return _read_json(path, "card")
+        return read_json(path, "card")
 
     def write_table(self, name: str, tensors: dict[str, Tensor], card: dict[str, Any]) -> None:
         """Store a table whole, by renaming; one of the same name is replaced.
@@ -242,30 +243,7 @@ class TakeStore:
     def _load(self, folder: Path, field: str) -> TensorDict:
         if not folder.is_dir():
             raise InputError(self.root, field, "is missing: python -m egopose.prepare makes it")
-        try:
-            _check_lengths(folder, field)
-            return TensorDict.load_memmap(folder)
-        except InputError:
-            raise
-        except Exception as error:  # tensordict raises whatever the damage happens to be
-            raise InputError(folder, field, f"is damaged: {error}") from None
-
-
-def _check_lengths(folder: Path, field: str) -> None:
-    """Mapping a file that was cut off would fill it with zeros in silence: its length tells beforehand."""
-    for key, entry in json.loads((folder / "meta.json").read_text()).items():
-        if isinstance(entry, dict) and "dtype" in entry:
-            size = int(np.prod(entry["shape"])) * getattr(torch, entry["dtype"].removeprefix("torch.")).itemsize
-            file = folder / f"{key}.memmap"
-            if not file.is_file() or file.stat().st_size < size:
-                raise InputError(folder, field, f"is damaged: {file.name} is cut off or missing")
-
-
-def _read_json(path: Path, field: str) -> Any:
-    try:
-        return json.loads(path.read_text())
-    except ValueError as error:
-        raise InputError(path, field, f"is damaged: {error}") from None
+        return load_tensors(folder, field)
 
 
 def runs_of(mask: np.ndarray) -> tuple[tuple[int, int], ...]:

@@ -16,6 +16,7 @@ import hashlib
 import json
 import os
 import shutil
+import sys
 import uuid
 from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
@@ -24,11 +25,19 @@ from typing import Any
 import torch
 from torchrl.checkpoint import Checkpoint, CheckpointError, CheckpointRotation
 
+from egopose import untrusted
 from egopose.errors import InputError
 
 SCHEMA = 1
 CHECKSUMS = "checksums.json"
 FOLDER = "checkpoints"
+_PREFIX = "checkpoint-"  # of TorchRL's rotation; the control steps follow
+#: Where :func:`recover` puts a checkpoint that is not whole.
+SET_ASIDE = "damaged-"
+
+
+class SaveFailed(RuntimeError):
+    """A checkpoint could not be written; those written before are as they were."""
 
 
 class ComponentState:
@@ -105,7 +114,11 @@ class RunCheckpoint(Checkpoint):
         )
 
     def save(self, path: str | Path, **options: Any) -> Path:
-        """Write beside ``path``, flush to the disk, then rename: a crash leaves the old checkpoint or the new one."""
+        """Write beside ``path``, flush to the disk, then rename: a crash leaves the old checkpoint or the new one.
+
+        Raises:
+            SaveFailed: the disk is full or cannot be written to; what was written of it is removed.
+        """
         destination = Path(path).absolute()
         stage = destination.parent / f".{destination.name}.part-{uuid.uuid4().hex}"
         try:
@@ -115,6 +128,8 @@ class RunCheckpoint(Checkpoint):
                 _flush(file)
             self._publish_path(stage, destination)
             _flush(destination.parent)
+        except (OSError, RuntimeError) as error:  # torch tells of a full disk in a RuntimeError
+            raise SaveFailed(f"{destination} cannot be written: {str(error).splitlines()[0]}") from error
         finally:
             shutil.rmtree(stage, ignore_errors=True)
         return destination
@@ -164,18 +179,18 @@ def verify(path: str | Path) -> dict[str, Any]:
     folder = Path(path)
     if not (folder / "manifest.json").is_file():
         raise InputError(folder, "manifest.json", "is missing: this is no checkpoint")
+    untrusted.check_checkpoint_files(folder)
+    manifest = untrusted.read_json(folder / "manifest.json", "manifest.json")
     try:
-        manifest = json.loads((folder / "manifest.json").read_text())
         metadata = dict(manifest["metadata"])
         schema = metadata["schema"]
     except (ValueError, KeyError, TypeError) as error:
         raise InputError(folder, "manifest.json", f"cannot be read ({error!r})") from None
     if not isinstance(schema, int) or schema > SCHEMA:
         raise InputError(folder, "schema", f"is {schema}, this version reads up to {SCHEMA}: install a newer egopose")
-    try:
-        expected = json.loads((folder / CHECKSUMS).read_text())
-    except (OSError, ValueError) as error:
-        raise InputError(folder, CHECKSUMS, f"cannot be read ({error!r})") from None
+    expected = untrusted.read_json(folder / CHECKSUMS, CHECKSUMS)
+    if not isinstance(expected, dict):
+        raise InputError(folder, CHECKSUMS, "cannot be read: is no object")
     found = _checksums(folder)
     for name in sorted(set(expected) | set(found)):
         if name not in found:
@@ -184,6 +199,7 @@ def verify(path: str | Path) -> dict[str, Any]:
             raise InputError(folder, name, "does not belong to the checkpoint")
         if expected[name] != found[name]:
             raise InputError(folder, name, "does not match its checksum: the checkpoint is damaged")
+    untrusted.check_checkpoint_states(folder)
     try:
         Checkpoint.manifest(folder)
     except CheckpointError as error:
@@ -212,7 +228,7 @@ def read_json(path: str | Path, component: str) -> Any:
     records = Checkpoint.manifest(path)["components"]
     if component not in records:
         raise InputError(path, component, "is missing in the checkpoint")
-    return json.loads((Path(path) / records[component]["path"] / "value.json").read_text())
+    return untrusted.read_json(Path(path) / records[component]["path"] / "value.json", component)
 
 
 def rotation(run_dir: str | Path, keep_last: int) -> CheckpointRotation:
@@ -221,10 +237,12 @@ def rotation(run_dir: str | Path, keep_last: int) -> CheckpointRotation:
 
 
 def find_checkpoint(path: str | Path, which: str = "latest") -> Path:
-    """A checkpoint folder from a run directory (its ``latest`` or ``best``) or from the folder's own path.
+    """A whole checkpoint folder from a run directory (its ``latest`` or ``best``), or the folder ``path`` itself.
+
+    In a run directory a damaged one is passed over, with a line on standard error, for the one before it.
 
     Raises:
-        InputError: there is no such run directory, or it holds no checkpoint yet.
+        InputError: there is no such run directory, or it holds no checkpoint yet, or none that is whole.
     """
     folder = Path(path)
     if (folder / "manifest.json").is_file():
@@ -233,11 +251,68 @@ def find_checkpoint(path: str | Path, which: str = "latest") -> Path:
         raise InputError(folder, "run directory", "does not exist")
     if not (folder / FOLDER).is_dir():
         raise InputError(folder, FOLDER, "is missing: neither a run directory nor a checkpoint")
-    kept = rotation(folder, keep_last=1)
-    found = kept.best() if which == "best" else kept.latest()
+    candidates = _by_step(folder)
+    if which == "best" and (best := rotation(folder, keep_last=1).best()) is not None:
+        candidates = [best, *(c for c in candidates if c != best)]
+    found, damaged = _first_whole(candidates)
+    for error in damaged if found is not None else []:
+        print(f"warning: {error}; taking {found}", file=sys.stderr, flush=True)
     if found is None:
-        raise InputError(folder / FOLDER, "checkpoint", "there is none yet")
+        raise damaged[0] if damaged else InputError(folder / FOLDER, "checkpoint", "there is none yet")
     return found
+
+
+def recover(run_dir: str | Path) -> Path | None:
+    """Put in order what a process that was killed left in ``run_dir``; to be called by the only one that writes there.
+
+    Half-written checkpoints are removed; damaged ones newer than the newest whole one are renamed to
+    ``damaged-...``, with a line on standard error, so that they are neither counted nor written over.
+
+    Returns:
+        The newest whole checkpoint; None where no checkpoint was ever finished.
+
+    Raises:
+        InputError: there are checkpoints and none is whole; they are left as they are.
+    """
+    root = Path(run_dir) / FOLDER
+    for left in sorted(root.glob(f".*{_PREFIX}*")):
+        name, _, ending = left.name.lstrip(".").partition(".")
+        if ending.startswith(("backup-", "delete-")) and not (root / name).exists() and _is_whole(left):
+            os.replace(left, root / name)  # it was being replaced or dropped: still a checkpoint
+        else:
+            shutil.rmtree(left, ignore_errors=True)
+    found, damaged = _first_whole(_by_step(Path(run_dir)))
+    if found is None and damaged:
+        raise damaged[0]
+    for error in damaged:
+        aside = Path(error.source).with_name(SET_ASIDE + Path(error.source).name)
+        shutil.rmtree(aside, ignore_errors=True)
+        os.replace(error.source, aside)
+        print(f"warning: {error}; put aside as {aside.name}, going on from {found}", file=sys.stderr, flush=True)
+    return found
+
+
+def _by_step(run_dir: Path) -> list[Path]:
+    """All checkpoint folders, damaged ones as well, the newest first."""
+    found = [p for p in (run_dir / FOLDER).glob(f"{_PREFIX}*") if p.name.removeprefix(_PREFIX).isdigit()]
+    return sorted(found, key=lambda p: int(p.name.removeprefix(_PREFIX)), reverse=True)
+
+
+def _first_whole(candidates: list[Path]) -> tuple[Path | None, list[InputError]]:
+    """The first that passes :func:`verify`, and what was wrong with those before it (``source`` is the folder)."""
+    damaged = []
+    for folder in candidates:
+        try:
+            verify(folder)
+        except InputError as error:
+            damaged.append(InputError(folder, error.field, error.cause))
+        else:
+            return folder, damaged
+    return None, damaged
+
+
+def _is_whole(folder: Path) -> bool:
+    return _first_whole([folder])[0] is not None
 
 
 def _files(folder: Path) -> list[Path]:
