@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -20,6 +21,7 @@ from egopose.envs.mdp.observations import humanoid_state
 from egopose.envs.problem import TakeTable
 from egopose.envs.starts import FragmentLike
 from egopose.errors import InputError
+from egopose.files import write_text_whole
 from egopose.humanoid.model import HumanoidModel
 from egopose.regression import kept_tables, regressor_tables
 
@@ -58,7 +60,10 @@ class Material:
     def keep_regressor(self, folder: Path) -> None:
         """Copy the state regressor's weights to ``folder/regressor``, so that a run can be used without its store."""
         if self.regressor is not None and not (folder / "regressor").exists():
-            shutil.copytree(self.regressor, folder / "regressor")
+            part = folder / "regressor.part"
+            shutil.rmtree(part, ignore_errors=True)
+            shutil.copytree(self.regressor, part)
+            os.replace(part, folder / "regressor")
 
     def keep_provenance(self, folder: Path) -> None:
         """Note in ``folder/provenance.json`` which store a run is trained on.
@@ -72,7 +77,7 @@ class Material:
             require_same_store(folder, self.store_fingerprint)
             return
         folder.mkdir(parents=True, exist_ok=True)
-        (folder / PROVENANCE).write_text(json.dumps({"store_fingerprint": self.store_fingerprint}, indent=1))
+        write_text_whole(folder / PROVENANCE, json.dumps({"store_fingerprint": self.store_fingerprint}, indent=1))
 
 
 def require_same_store(run: Path, fingerprint: str) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import importlib.metadata
+import io
 import json
 import platform
 import subprocess
@@ -18,6 +19,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from egopose.errors import InputError
+from egopose.files import write_text_whole
 
 PACKAGES = ("egopose", "torch", "torchrl", "tensordict", "mujoco", "dm-control", "numpy", "hydra-core")
 CURVES = "curves.csv"
@@ -34,7 +36,8 @@ class Scalars(Protocol):
 class CsvCurves:
     """``curves.csv``: one row an iteration.
 
-    Rows after ``iteration`` are dropped on opening, for a resumed run redoes them.
+    Rows after ``iteration`` are dropped on opening, for a resumed run redoes them; so is one that was cut off when the
+    process that wrote it was killed.
 
     A figure that comes up later (an evaluation's) becomes a new column; earlier rows are empty there.
     """
@@ -44,8 +47,9 @@ class CsvCurves:
         self.columns: list[str] = []
         self.rows: list[dict[str, Any]] = []
         if path.is_file() and iteration > 0:
-            with path.open(newline="") as stream:
-                self.rows = [row for row in csv.DictReader(stream) if int(float(row["iteration"])) <= iteration]
+            with path.open(newline="", encoding="utf-8", errors="replace") as stream:
+                lines = csv.DictReader(line.replace("\0", "") for line in stream)
+                self.rows = [row for row in lines if None not in row.values() and _iteration(row) <= iteration]
             self.columns = list(self.rows[0]) if self.rows else []
         self._rewrite()
 
@@ -63,10 +67,19 @@ class CsvCurves:
         """Nothing is held open."""
 
     def _rewrite(self) -> None:
-        with self.path.open("w", newline="") as stream:
-            writer = csv.DictWriter(stream, self.columns)
-            writer.writeheader()
-            writer.writerows(self.rows)
+        stream = io.StringIO(newline="")
+        writer = csv.DictWriter(stream, self.columns)
+        writer.writeheader()
+        writer.writerows(self.rows)
+        write_text_whole(self.path, stream.getvalue())
+
+
+def _iteration(row: Mapping[str, Any]) -> float:
+    """Of a row of ``curves.csv``; infinity where it cannot be read."""
+    try:
+        return float(row["iteration"])
+    except (KeyError, ValueError):
+        return float("inf")
 
 
 class TensorBoardScalars:
@@ -124,9 +137,9 @@ def build_loggers(
 def write_provenance(run_dir: Path, config: Mapping[str, Any]) -> None:
     """``config.yaml`` (resolved), ``versions.json``, ``git.json`` into the run directory."""
     run_dir.mkdir(parents=True, exist_ok=True)
-    (run_dir / "config.yaml").write_text(OmegaConf.to_yaml(OmegaConf.create(dict(config))))
-    (run_dir / "versions.json").write_text(json.dumps(versions(), indent=1))
-    (run_dir / "git.json").write_text(json.dumps(git_state(Path(__file__).resolve().parent), indent=1))
+    write_text_whole(run_dir / "config.yaml", OmegaConf.to_yaml(OmegaConf.create(dict(config))))
+    write_text_whole(run_dir / "versions.json", json.dumps(versions(), indent=1))
+    write_text_whole(run_dir / "git.json", json.dumps(git_state(Path(__file__).resolve().parent), indent=1))
 
 
 def versions() -> dict[str, str]:

@@ -1,0 +1,24 @@
+"""Small files that are there whole or not at all."""
+
+from __future__ import annotations
+
+import os
+import uuid
+from pathlib import Path
+
+
+def write_text_whole(path: Path, text: str) -> None:
+    """Write beside ``path``, flush to the disk, rename: whenever the process ends, the old text is there or the new.
+
+    Raises:
+        OSError: the disk is full, or the folder cannot be written to; nothing is left beside ``path``.
+    """
+    part = path.with_name(f".{path.name}.part-{uuid.uuid4().hex}")
+    try:
+        with part.open("w") as stream:
+            stream.write(text)
+            stream.flush()
+            os.fsync(stream.fileno())
+        os.replace(part, path)
+    finally:
+        part.unlink(missing_ok=True)
