@@ -136,7 +136,7 @@ def test_divergence_is_the_closed_form() -> None:
     assert ppo.divergence(rows) == pytest.approx(1.0, rel=1e-5)
 
 
-def test_nonfinite_minibatches_are_skipped_then_stop_the_run_with_a_checkpoint(tmp_path: Path) -> None:
+def test_nonfinite_minibatches_are_skipped_then_stop_the_run(tmp_path: Path) -> None:
     run = make_run(tmp_path, minibatch_size=None, epochs=1)
     batch = next(iter(run.collector))
     rows = run.ppo.advantages(batch)
@@ -148,9 +148,8 @@ def test_nonfinite_minibatches_are_skipped_then_stop_the_run_with_a_checkpoint(t
     run = make_run(tmp_path, minibatch_size=None, epochs=4)
     run.collector.env.base_env.x.fill_(float("nan"))
     run.collector._carrier["humanoid_state"].fill_(float("nan"))
-    with pytest.raises(TrainingDiverged, match="saved in"):
+    with pytest.raises(TrainingDiverged, match="no checkpoint had been written"):
         train(run, [])
-    assert list((tmp_path / "checkpoints").iterdir())
 
 
 def test_figures_of_a_batch() -> None:

@@ -6,7 +6,7 @@ import signal
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import FrameType
@@ -25,6 +25,10 @@ from egopose.training.logging import ProgressLine, Scalars
 from egopose.training.ppo import PPO, TrainingDiverged
 
 Evaluation = Callable[[int], Mapping[str, float]]
+
+
+class TrainingStopped(RuntimeError):
+    """Something outside the run ended it: a full disk, a process that was killed. Its checkpoints are whole."""
 
 
 @dataclass(frozen=True)
@@ -54,9 +58,10 @@ class LoopSettings:
     def from_config(cls, values: Mapping[str, Any], source: str = "conf/train.yaml") -> LoopSettings:
         """Raises InputError: a key is missing, unknown or out of range."""
         settings = from_mapping(cls, values, source)
-        for name in ("iterations", "steps_per_iteration", "checkpoint_every", "keep_last"):
-            if getattr(settings, name) < 1:
-                raise InputError(source, name, f"must be at least 1, not {getattr(settings, name)}")
+        # Two checkpoints: where the last one is damaged, there must be one before it.
+        for name, least in (("iterations", 1), ("steps_per_iteration", 1), ("checkpoint_every", 1), ("keep_last", 2)):
+            if getattr(settings, name) < least:
+                raise InputError(source, name, f"must be at least {least}, not {getattr(settings, name)}")
         for name in ("total_steps", "max_seconds"):
             if getattr(settings, name) is not None and getattr(settings, name) <= 0:
                 raise InputError(source, name, f"must be positive or null, not {getattr(settings, name)}")
@@ -107,6 +112,7 @@ class Run:
     config: Mapping[str, Any]
     action_size: int
     counters: Counters = field(default_factory=Counters)
+    _saved: tuple[int, Path] | None = None
 
     @property
     def task(self) -> str:
@@ -129,11 +135,25 @@ class Run:
         )
 
     def save(self) -> Path:
-        """Write a checkpoint named after the control steps so far, and drop those no longer kept."""
+        """Write a checkpoint named after the control steps so far, and drop those no longer kept.
+
+        Where this run directory's checkpoint of these steps was written or restored by this very run, it stays.
+
+        Raises:
+            TrainingDiverged: a weight or a statistic is not finite; nothing is written.
+            SaveFailed: see :meth:`RunCheckpoint.save`.
+        """
         state = self.counters
+        if self._saved is not None and self._saved[0] == state.frames and self._saved[1].is_dir():
+            return self._saved[1]
+        components = self.checkpoint()
+        for name in ("policy", "critic", "policy_optimizer", "value_optimizer", "transforms"):
+            if (found := _not_finite(components.components[name].state_dict(), name)) is not None:
+                raise TrainingDiverged(f"{found} is not finite")
         metadata = checkpoints.metadata_of(self.task, self.action_size, state.iteration, state.frames, state.score)
         kept = checkpoints.rotation(self.folder, self.settings.keep_last)
-        return kept.save(self.checkpoint(), step=state.frames, metadata=metadata)
+        self._saved = state.frames, kept.save(components, step=state.frames, metadata=metadata)
+        return self._saved[1]
 
     def restore(self, path: str | Path) -> None:
         """Take over everything from a checkpoint of a run with the same configuration.
@@ -150,6 +170,8 @@ class Run:
         self.counters = Counters(**checkpoints.read_json(path, "trainer_state"))
         restored.restore(path, {"rng"})
         self.collector.update_policy_weights_()
+        if Path(path).resolve().parent == (self.folder / checkpoints.FOLDER).resolve():
+            self._saved = self.counters.frames, Path(path)
 
 
 class _TransformState:
@@ -176,12 +198,14 @@ def train(run: Run, loggers: Sequence[Scalars], evaluate: Evaluation | None = No
             mean episode length in training does).
 
     Raises:
-        TrainingDiverged: see :meth:`PPO.update`; a checkpoint is saved before.
+        TrainingDiverged: see :meth:`PPO.update` and :meth:`Run.save`.
+        TrainingStopped: the disk is full, or a process of the collector is gone.
+
+    In either case the checkpoints written before are whole, and the message names the last one.
     """
     settings, counters = run.settings, run.counters
     progress = ProgressLine(settings.iterations, counters.iteration, settings.max_seconds)
     begin = time.monotonic()
-    saved: Path | None = None
     slowest = 0.0
     batches = iter(run.collector)
     with stop_signals() as stop:
@@ -193,16 +217,40 @@ def train(run: Run, loggers: Sequence[Scalars], evaluate: Evaluation | None = No
                 for logger in loggers:
                     logger.write(counters.frames, figures)
                 progress.update(counters.iteration, figures)
-                saved = run.save() if counters.iteration % settings.checkpoint_every == 0 else None
+                if counters.iteration % settings.checkpoint_every == 0:
+                    run.save()
                 slowest = max(slowest, time.monotonic() - started)
                 counters.seconds += time.monotonic() - started
+            return Outcome(reason, counters.iteration, counters.frames, run.save())
         except TrainingDiverged as error:
-            raise TrainingDiverged(f"{error}; the state before is saved in {run.save()}") from None
+            # Nothing of it is saved: some of this iteration's gradient steps may have been the ones that led here.
+            raise TrainingDiverged(f"{error}; {_what_is_kept(run)}") from error
+        except (OSError, checkpoints.SaveFailed) as error:
+            raise TrainingStopped(f"{error}; {_what_is_kept(run)}") from error
         finally:
             progress.close()
             for logger in loggers:
-                logger.close()
-    return Outcome(reason, counters.iteration, counters.frames, saved or run.save())
+                with suppress(OSError):  # on a full disk: what stopped the run is told already
+                    logger.close()
+
+
+def _what_is_kept(run: Run) -> str:
+    """What a run that cannot go on leaves behind."""
+    try:
+        return f"the last checkpoint is {checkpoints.find_checkpoint(run.folder)}"
+    except InputError:
+        return "no checkpoint had been written yet"
+
+
+def _not_finite(state: Any, name: str) -> str | None:
+    """The dotted name of the first tensor with a value that is not finite, or None."""
+    if isinstance(state, torch.Tensor):
+        return None if torch.isfinite(state).all() else name
+    if isinstance(state, Mapping):
+        for key, value in state.items():
+            if (found := _not_finite(value, f"{name}.{key}")) is not None:
+                return found
+    return None
 
 
 def _judge(run: Run, figures: Mapping[str, float], evaluate: Evaluation | None) -> dict[str, float]:
