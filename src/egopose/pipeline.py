@@ -6,12 +6,14 @@ The way of training: store of takes -> state regressor's tables -> environment -
 from __future__ import annotations
 
 import copy
+import random
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import Compose, EnvBase, TransformedEnv
@@ -155,7 +157,8 @@ def build_run(config: Mapping[str, Any], folder: Path, material: Material) -> Ru
     collector_settings = CollectorSettings.from_config(config["collector"])
     ppo_settings = PPOSettings.from_config(algo)
 
-    torch.manual_seed(int(config["seed"]))
+    for seed in (torch.manual_seed, random.seed, np.random.seed):
+        seed(int(config["seed"]) % 2**32)
     probe = build_env(config, material, worlds=1)
     actor, critic = build_networks(config, material, probe)
     action_size = int(probe.action_spec.shape[-1])
