@@ -1,6 +1,7 @@
 """``python -m egopose.bench VERB [--json] [--rounds N] [key=value ...]``: measure the program's own parts.
 
 env: the collection loop beside MuJoCo's own speed.
+resume: a training killed at random moments beside the same one left alone.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from importlib import import_module  # noqa: E402
 from egopose.errors import InputError  # noqa: E402
 
 #: Verbs and how many rounds each takes unless told; a verb's module is ``egopose.benchmarks.<verb>``.
-VERBS = {"env": 9}
+VERBS = {"env": 9, "resume": 50}
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
