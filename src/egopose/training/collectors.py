@@ -4,17 +4,29 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from functools import partial
 from typing import Any
 
 import torch
-from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torchrl.collectors import Collector
-from torchrl.envs import EnvBase, TransformedEnv
+from torchrl.envs import EnvBase
 
 from egopose.config import from_mapping
 from egopose.errors import InputError
+from egopose.training.workers import Workers, base_env, read_simulation, write_simulation
+
+__all__ = [
+    "CollectorSettings",
+    "base_env",
+    "build_collector",
+    "load_simulation_state",
+    "load_transform_state",
+    "set_threads",
+    "simulation_state",
+    "transform_state",
+]
+
+KINDS = ("sync", "multi_sync", "multi_async", "ray")
 
 
 @dataclass(frozen=True)
@@ -22,12 +34,14 @@ class CollectorSettings:
     """See ``conf/collector``.
 
     Args:
-        kind: ``sync`` in this process, or ``multi_sync`` in ``workers`` processes.
+        kind: ``sync`` in this process; ``multi_sync`` and ``multi_async`` in processes, ``ray`` on machines of a Ray
+            cluster: see :class:`egopose.training.workers.Workers`.
         worlds: of one environment.
         physics_threads: of one environment.
         workers: processes, each with an environment of its own.
         threads: torch threads while collecting; physics has threads of its own.
         update_threads: torch threads while the networks are updated.
+        address: of the Ray cluster, see :class:`egopose.training.workers.Workers`.
     """
 
     kind: str
@@ -36,13 +50,14 @@ class CollectorSettings:
     workers: int
     threads: int
     update_threads: int
+    address: str | None = None
 
     @classmethod
     def from_config(cls, values: Mapping[str, Any], source: str = "conf/collector") -> CollectorSettings:
         """Raises InputError: a key is missing, unknown or out of range."""
         settings = from_mapping(cls, values, source)
-        if settings.kind not in ("sync", "multi_sync"):
-            raise InputError(source, "kind", f"must be sync or multi_sync, not {settings.kind!r}")
+        if settings.kind not in KINDS:
+            raise InputError(source, "kind", f"must be one of {', '.join(KINDS)}, not {settings.kind!r}")
         for name in ("worlds", "physics_threads", "workers", "threads", "update_threads"):
             if getattr(settings, name) < 1:
                 raise InputError(source, name, f"must be at least 1, not {getattr(settings, name)}")
@@ -54,8 +69,8 @@ def build_collector(
     make_env: Callable[[int], EnvBase],
     policy: TensorDictModuleBase,
     steps_per_iteration: int,
-) -> Collector:
-    """A TorchRL collector that never ends; one iteration gives ``steps_per_iteration`` control steps over all worlds.
+) -> Collector | Workers:
+    """A collector that never ends; one iteration gives ``steps_per_iteration`` control steps over all worlds.
 
     ``make_env`` gets the worker's number, to seed by.
 
@@ -70,76 +85,53 @@ def build_collector(
             track_traj_ids=False,
             auto_register_policy_transforms=False,
         )
-    return Collector(
-        [partial(make_env, worker) for worker in range(settings.workers)],
+    return Workers(
+        settings.kind,
+        make_env,
         policy,
-        backend="process",
-        num_collectors=settings.workers,
-        sync=True,
-        frames_per_batch=steps_per_iteration,
-        total_frames=-1,
-        cat_results=0,
-        auto_register_policy_transforms=False,
+        workers=settings.workers,
+        worlds=settings.worlds,
+        steps_per_iteration=steps_per_iteration,
+        threads=settings.threads,
+        cpus=settings.physics_threads,
+        address=settings.address,
     )
 
 
-def is_in_process(collector: Any) -> bool:
-    """Whether the environment lives in this process, so that its state can be saved and set again."""
-    return isinstance(getattr(collector, "env", None), EnvBase)
-
-
-def base_env(env: EnvBase) -> EnvBase:
-    """The environment under all its transforms."""
-    while isinstance(env, TransformedEnv):
-        env = env.base_env
-    return env
-
-
 def transform_state(collector: Any) -> Mapping[str, Any]:
-    """State of the environment's transforms (the normaliser's statistics); of worker 0 with several processes."""
-    if is_in_process(collector):
-        return collector.env.state_dict()
-    return collector.state_dict()["worker0"]["env_state_dict"]
+    """State of the environment's transforms: the normaliser's statistics of everything collected, by all workers."""
+    return collector.transforms if isinstance(collector, Workers) else collector.env.state_dict()
 
 
 def load_transform_state(collector: Any, state: Mapping[str, Any]) -> None:
-    """Set it, in every process."""
-    if is_in_process(collector):
+    """Set it, in every process. With workers, before the first batch only."""
+    if isinstance(collector, Workers):
+        collector.load_transform_state(state)
+    else:
         collector.env.load_state_dict(state)
-        return
-    worker_states = collector.state_dict()
-    for name in worker_states:
-        if name.startswith("worker"):
-            worker_states[name]["env_state_dict"] = state
-    collector.load_state_dict(worker_states)
 
 
 def simulation_state(collector: Any) -> dict[str, Any]:
     """Where every world stands: the base environment's own state and what the policy will see next.
 
-    Empty where the environments live in other processes; training then goes on from fresh episodes.
+    With workers, of each at the end of its last batch.
     """
-    if not is_in_process(collector):
-        return {}
-    # TorchRL keeps the observation after the last step, and nothing else tells it, in `_carrier`.
-    carrier: TensorDictBase = collector._carrier
-    seen = {".".join(_path(key)): value.clone() for key, value in carrier.items(True, True)}
-    return {"carrier": seen, "worlds": dict(base_env(collector.env).state_dict())}
+    if isinstance(collector, Workers):
+        return {f"worker{number}": state for number, state in enumerate(collector.simulation)}
+    return read_simulation(collector)
 
 
 def load_simulation_state(collector: Any, state: Mapping[str, Any]) -> None:
-    """The opposite of :func:`simulation_state`; does nothing with an empty state.
+    """The opposite of :func:`simulation_state`. With workers, before the first batch only.
 
     Raises:
-        InputError: the environment does not take the state, being of another size.
+        InputError: the environments do not take the state, being of another size or number.
     """
-    if not state:
-        return
-    carrier: TensorDictBase = collector._carrier
-    entries = {tuple(key.split(".")): value for key, value in state["carrier"].items()}
     try:
-        base_env(collector.env).load_state_dict(state["worlds"])
-        carrier.update(TensorDict(entries, batch_size=carrier.batch_size))
+        if isinstance(collector, Workers):
+            collector.load_simulation_state([state[f"worker{number}"] for number in range(len(state))])
+        else:
+            write_simulation(collector, state)
     except (ValueError, KeyError, RuntimeError) as error:
         raise InputError("simulation", "worlds", str(error)) from None
 
@@ -148,7 +140,3 @@ def set_threads(count: int) -> None:
     """Torch's threads inside an operator, from now on."""
     if torch.get_num_threads() != count:
         torch.set_num_threads(count)
-
-
-def _path(key: Any) -> tuple[str, ...]:
-    return key if isinstance(key, tuple) else (key,)

@@ -1,0 +1,269 @@
+"""Environments in processes of their own, on this machine or on many: one collector over TorchRL's three.
+
+Between two of its batches a worker is idle, and only then is it spoken to: a message that reaches a busy worker of
+TorchRL makes it throw its batch away. What is exchanged then: the worker gives the statistics of its normaliser and
+where its worlds stand, and gets the statistics of all workers back.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
+from typing import Any
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torchrl.collectors import Collector, MultiAsyncCollector, MultiSyncCollector
+from torchrl.envs import EnvBase, TransformedEnv
+
+from egopose.errors import InputError
+from egopose.training.moments import merge_states, without_counts
+
+State = dict[str, Any]
+
+#: Ray's collector ends at a number of frames and takes no "never"; at a million a second this is 290 thousand years.
+_ENDLESS = 2**63 - 1
+
+
+def base_env(env: EnvBase) -> EnvBase:
+    """The environment under all its transforms."""
+    while isinstance(env, TransformedEnv):
+        env = env.base_env
+    return env
+
+
+def read_simulation(collector: Collector) -> State:
+    """Where every world of a collector's own environment stands, and what the policy will see next."""
+    # TorchRL keeps the observation after the last step, and nothing else tells it, in `_carrier`.
+    seen = {".".join(_path(key)): value.clone() for key, value in collector._carrier.items(True, True)}
+    return {"carrier": seen, "worlds": dict(base_env(collector.env).state_dict())}
+
+
+def write_simulation(collector: Collector, state: Mapping[str, Any]) -> None:
+    """The opposite of :func:`read_simulation`.
+
+    Raises:
+        ValueError, KeyError, RuntimeError: the environment does not take the state, being of another size.
+    """
+    carrier: TensorDictBase = collector._carrier
+    entries = {tuple(key.split(".")): value for key, value in state["carrier"].items()}
+    base_env(collector.env).load_state_dict(state["worlds"])
+    carrier.update(TensorDict(entries, batch_size=carrier.batch_size))
+
+
+class WorkerCollector(Collector):
+    """The collector inside a worker, with what the learner asks of it between two batches."""
+
+    def transform_state(self) -> State:
+        """State of the environment's transforms, copied."""
+        return {key: value.clone() for key, value in self.env.state_dict().items()}
+
+    def load_transform_state(self, state: Mapping[str, Any]) -> None:
+        """Set it."""
+        self.env.load_state_dict(state)
+
+    def simulation_state(self) -> State:
+        """Worlds, what the policy sees next, and the random numbers its actions are drawn by."""
+        return {**read_simulation(self), "rng": torch.get_rng_state()}
+
+    def load_simulation_state(self, state: Mapping[str, Any]) -> None:
+        """The opposite of :meth:`simulation_state`."""
+        write_simulation(self, state)
+        torch.set_rng_state(state["rng"])
+
+    def report(self) -> tuple[State, State]:
+        """What a worker gives at the end of a batch: :meth:`transform_state` and :meth:`simulation_state`."""
+        return self.transform_state(), self.simulation_state()
+
+
+class _AnnouncingCollector(MultiAsyncCollector):
+    """Tells whose batch has come in while that worker still waits to be sent on."""
+
+    announce: Callable[[int], None] | None = None
+
+    def _get_from_queue(self, timeout: float | None = None) -> tuple[int, int, TensorDictBase]:
+        index, round_, batch = super()._get_from_queue(timeout)
+        if self.announce is not None:
+            self.announce(index)
+        return index, round_, batch
+
+
+class Workers:
+    """Batches ``[workers * worlds, T]`` from environments in other processes; see ``conf/collector``.
+
+    Args:
+        kind: ``multi_sync``: all workers in step, on the newest weights. ``multi_async``: workers collect on while the
+            networks are updated; an iteration takes as many pieces as there are workers, from whoever has one, the
+            oldest collected on weights one update old. ``ray``: in step, on any machine of a Ray cluster.
+        make_env: makes the environment of the worker of that number, in its process.
+        policy: whose parameters :meth:`update_policy_weights_` sends.
+        workers: how many.
+        worlds: of each environment.
+        steps_per_iteration: control steps an iteration, over all workers; rounded up to whole steps of all worlds.
+        threads: of torch in a worker.
+        cpus: that Ray keeps for a worker.
+        address: of the Ray cluster, ``auto`` for the one this machine belongs to; None starts one here.
+
+    Raises:
+        InputError: Ray is not installed, not found, or has not the cores.
+    """
+
+    def __init__(
+        self,
+        kind: str,
+        make_env: Callable[[int], EnvBase],
+        policy: TensorDictModuleBase,
+        *,
+        workers: int,
+        worlds: int,
+        steps_per_iteration: int,
+        threads: int,
+        cpus: int,
+        address: str | None = None,
+    ) -> None:
+        self.kind, self.policy, self.count = kind, policy, workers
+        self._end_ray: Callable[[], None] | None = None
+        frames = -(-steps_per_iteration // (workers * worlds)) * worlds
+        # Each process would begin with the same random numbers otherwise, and all draw the same actions.
+        makers = [partial(_seeded, make_env, torch.initial_seed(), number) for number in range(workers)]
+        if kind == "ray":
+            self._end_ray = _join_ray(workers * cpus, address)
+            self._collector = _ray_collector(makers, policy, frames, threads, cpus)
+        else:
+            collector_class = _AnnouncingCollector if kind == "multi_async" else MultiSyncCollector
+            self._collector = collector_class(
+                makers,
+                policy,
+                frames_per_batch=frames * (workers if kind == "multi_sync" else 1),
+                total_frames=-1,
+                cat_results=0 if kind == "multi_sync" else None,
+                num_sub_threads=threads,
+                num_threads=torch.get_num_threads(),
+                collector_class=WorkerCollector,
+                auto_register_policy_transforms=False,
+            )
+        self.update_policy_weights_()
+        reports = self._call_all("report")
+        self.simulation: list[State] = [simulation for _, simulation in reports]
+        # What the workers' first resets counted is still theirs to report.
+        self.transforms = without_counts(reports[0][0])
+        self._given = [self.transforms] * workers
+        if kind == "multi_async":
+            self._collector.announce = self._exchange
+
+    def __iter__(self) -> Iterator[TensorDictBase]:
+        batches = iter(self._collector)
+        while True:
+            if self.kind == "multi_async":
+                yield torch.cat([next(batches) for _ in range(self.count)])
+                continue
+            batch = next(batches)
+            self._exchange_all()
+            yield batch.flatten(0, 1) if self.kind == "ray" else batch
+
+    def update_policy_weights_(self) -> None:
+        """Send the policy's present parameters to all workers."""
+        self._collector.update_policy_weights_(self.policy)
+
+    def load_transform_state(self, state: Mapping[str, Any]) -> None:
+        """Give all workers these statistics. Before the first batch only: a busy worker would lose its batch."""
+        self._call_all("load_transform_state", [(dict(state),)] * self.count)
+        self.transforms = dict(state)
+        self._given = [self.transforms] * self.count
+
+    def load_simulation_state(self, states: Sequence[Mapping[str, Any]]) -> None:
+        """Put every worker where it stood at the end of its last batch. Before the first batch only.
+
+        Raises:
+            ValueError: there are more or fewer workers than states.
+        """
+        if len(states) != self.count:
+            raise ValueError(f"is of {len(states)} workers, this run has {self.count}")
+        self._call_all("load_simulation_state", [(dict(state),) for state in states])
+        self.simulation = [dict(state) for state in states]
+
+    def shutdown(self) -> None:
+        """End the workers, and the Ray cluster where it was started for them."""
+        self._collector.shutdown()
+        if self._end_ray is not None:
+            self._end_ray()
+
+    def _exchange_all(self) -> None:
+        reports = self._call_all("report")
+        states, self.simulation = [report[0] for report in reports], [report[1] for report in reports]
+        self.transforms = merge_states(self.transforms, states, self._given)
+        self._call_all("load_transform_state", [(self.transforms,)] * self.count)
+        self._given = [self.transforms] * self.count
+
+    def _exchange(self, number: int) -> None:
+        state, self.simulation[number] = self._call(number, "report")
+        self.transforms = merge_states(self.transforms, [state], [self._given[number]])
+        self._call(number, "load_transform_state", self.transforms)
+        self._given[number] = self.transforms
+
+    def _call_all(self, method: str, arguments: list[tuple[Any, ...]] | None = None) -> list[Any]:
+        return self._collector.map_fn(method, arguments)
+
+    def _call(self, number: int, method: str, *arguments: Any) -> Any:
+        # TorchRL asks all workers or none; this is what its `map_fn` does, for one.
+        pipe = self._collector.pipes[number]
+        pipe.send(((method, arguments, {}), "cascade_execute"))
+        result, _ = self._collector._recv_and_check(pipe, worker_idx=number)
+        if isinstance(result, Exception):
+            raise result
+        return result
+
+
+def _seeded(make_env: Callable[[int], EnvBase], seed: int, number: int) -> EnvBase:
+    torch.manual_seed((seed * 1000 + 1 + number) % 2**63)
+    return make_env(number)
+
+
+def _threaded(make_env: Callable[[], EnvBase], threads: int) -> EnvBase:
+    torch.set_num_threads(threads)
+    return make_env()
+
+
+def _join_ray(cpus: int, address: str | None) -> Callable[[], None] | None:
+    """Connect to a Ray cluster that has the cores; returns what ends it, None where it was there before."""
+    try:
+        import ray
+    except ImportError:
+        raise InputError("conf/collector", "kind", "ray needs Ray: pip install 'egopose[ray]'") from None
+    there = ray.is_initialized()
+    if not there:
+        # A cluster made here is told of as many cores as are wanted: threads share them, Ray only counts.
+        place: dict[str, Any] = {"num_cpus": cpus} if address is None else {"address": address}
+        # What runtime.prepare_runtime sets here, for processes that this one does not start.
+        environment = {"env_vars": {"OMP_WAIT_POLICY": "PASSIVE", "GOMP_SPINCOUNT": "0"}}
+        try:
+            ray.init(**place, include_dashboard=False, log_to_driver=False, runtime_env=environment)
+        except ConnectionError as error:
+            raise InputError("conf/collector", "address", f"no Ray cluster answers at {address!r}: {error}") from None
+    free = ray.available_resources().get("CPU", 0)
+    if free < cpus:
+        # Ray would wait, for as long as it takes, for others to end or machines to join.
+        raise InputError("conf/collector", "workers", f"want {cpus} cores, the Ray cluster has {free:g} free")
+    return None if there else ray.shutdown
+
+
+def _ray_collector(
+    makers: Sequence[Callable[[], EnvBase]], policy: TensorDictModuleBase, frames: int, threads: int, cpus: int
+) -> Any:
+    from torchrl.collectors.distributed import RayCollector
+
+    return RayCollector(
+        [partial(_threaded, make, threads) for make in makers],
+        policy,
+        frames_per_batch=frames * len(makers),
+        total_frames=_ENDLESS,
+        sync=True,
+        collector_class=WorkerCollector,
+        collector_kwargs=[{"auto_register_policy_transforms": False, "track_traj_ids": False} for _ in makers],
+        remote_configs={"num_cpus": cpus},
+    )
+
+
+def _path(key: Any) -> tuple[str, ...]:
+    return key if isinstance(key, tuple) else (key,)
