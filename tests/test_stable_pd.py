@@ -1,14 +1,15 @@
-"""MuJoCo's implicit actuators against stable PD as it was published.
+"""The model's own actuators against stable PD as it was published.
 
 The reference (Tan, Liu and Turk 2011, "Stable Proportional-Derivative Controllers", eqs. 9-11) solves in Python, at
 every substep of 450 Hz, ``(M + h kd) qacc = -C - kp (q + h qvel - target) - kd qvel + external`` and applies
 ``-kp (q + h qvel - target) - kd (qvel + h qacc)``, the external forces being the contacts of the substep before. Both
 bodies start on a frame of a real walk and track it for half a second with the same targets.
 
-Measured, over all 52 joints and 15 control steps from three starts: **0.0002 rad apart at most in the air** (the walk
-lifted off the floor), so the two are the same controller; **on the floor 0.001 to 0.0045 rad on average, 0.08 rad at
-most**, always at an ankle. There MuJoCo's solver sees the body's bare inertia while it finds the contact forces and
-adds the implicit damping afterwards, which weighs eight times a foot's inertia; the reference has it in its torque.
+Measured, over all 52 joints and 15 control steps from three starts: **nothing (below 1e-9 rad) apart in the air** (the
+walk lifted off the floor) and up to 0.0044 rad while a torque limit holds there: the model clips the explicit torque,
+the reference the sum; **on the floor 0.0009 rad on average at most, 0.022 rad at most**, at an ankle: the reference
+knows the
+contact forces of the substep before, MuJoCo those of this one.
 """
 
 from __future__ import annotations
@@ -38,7 +39,7 @@ def stable_pd(humanoid: HumanoidModel, qpos: np.ndarray, qvel: np.ndarray, targe
     """Joint angles ``[steps, 52]`` after each control step under reference stable PD on the same body."""
     model = mujoco.MjModel.from_xml_string(humanoid.xml)
     model.jnt_actfrclimited[:] = 0  # the limit is applied to the applied force below
-    model.opt.integrator = mujoco.mjtIntegrator.mjINT_EULER
+    model.dof_armature[6:] -= model.opt.timestep * humanoid.kd  # the model's share of the damping: added below
     model.actuator_gainprm[:] = 0.0
     model.actuator_biasprm[:] = 0.0
     data = mujoco.MjData(model)
@@ -83,7 +84,7 @@ def unlimited(humanoid: HumanoidModel) -> HumanoidModel:
 
 @pytest.mark.parametrize("start", [0, 20, 40])
 def test_stays_near_where_a_torque_limit_holds(walk: Motion, start: int) -> None:
-    """At start 0 a knee saturates: MuJoCo keeps its implicit damping there, stable PD as published clips the sum."""
+    """At start 0 a knee saturates: the model clips the explicit torque, stable PD as published the sum."""
     humanoid = default_humanoid()
     qvel = finite_difference(walk.qpos, walk.fps)
     frames = np.arange(start + 1, start + 16)
@@ -91,11 +92,11 @@ def test_stays_near_where_a_torque_limit_holds(walk: Motion, start: int) -> None
     qpos = walk.qpos[start].copy()
     qpos[2] += 5.0
     native, reference = (track(humanoid, qpos, qvel[start], targets) for track in (implicit_pd, stable_pd))
-    assert np.abs(native - reference).max() < 0.001
+    assert np.abs(native - reference).max() < 0.006
 
 
 @pytest.mark.parametrize("start", [0, 20, 40])
-@pytest.mark.parametrize(("lift", "largest", "mean"), [(5.0, 0.0005, 0.00005), (0.0, 0.1, 0.006)], ids=["air", "floor"])
+@pytest.mark.parametrize(("lift", "largest", "mean"), [(5.0, 1e-9, 1e-9), (0.0, 0.03, 0.0012)], ids=["air", "floor"])
 def test_tracks_a_walk_as_reference_stable_pd_does(
     walk: Motion, start: int, lift: float, largest: float, mean: float
 ) -> None:

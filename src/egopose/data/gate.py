@@ -24,6 +24,7 @@ from typing import Any  # noqa: E402
 import numpy as np  # noqa: E402
 
 from egopose.config import compose_config  # noqa: E402
+from egopose.data.feasibility import contact_residual  # noqa: E402
 from egopose.data.prepare_motion import PreparationSettings, reference_motion  # noqa: E402
 from egopose.data.reference import reference_states, supported  # noqa: E402
 from egopose.data.sources import TakeSource, find_sources  # noqa: E402
@@ -39,6 +40,8 @@ from egopose.motion.rotations import Array  # noqa: E402
 #: Control steps driven from every start, every how many frames a start, and seconds of reference velocity added to the
 #: target: PD with kd = 0.1 kp lags by 0.1 s of it, and 0.06 s follows best over the first steps.
 STEPS, STRIDE, LEAD = 3, 3, 0.06
+#: Body weights that contact may fall short of what the motion needs in a frame that is started from or driven to.
+LARGEST_RESIDUAL = 0.25
 #: A clip passes at or below this mean height error (m) and above this mean root reward.
 LARGEST_HEIGHT_ERROR, LEAST_ROOT_REWARD = 0.01, 0.85
 
@@ -50,6 +53,7 @@ class GateResult:
     Args:
         starts: how many; 0 for a clip too short, or nowhere on the floor.
         supported: share of the clip's frames a body on a bare floor could be in.
+        feasible: share of the clip's frames that are supported and that contact with the floor can have made.
         height_error: ``[STEPS]`` mean over starts of the root's ``|height - reference|``, m.
         height_bias: ``[STEPS]`` the same with its sign: below zero the body sinks.
         root_reward: ``[STEPS]`` mean over starts of r_p.
@@ -57,6 +61,7 @@ class GateResult:
 
     starts: int
     supported: float
+    feasible: float
     height_error: tuple[float, ...]
     height_bias: tuple[float, ...]
     root_reward: tuple[float, ...]
@@ -81,8 +86,13 @@ class GateResult:
         )
 
 
-def open_loop_gate(humanoid: HumanoidModel, clip: Motion, threads: int = 1) -> GateResult:
-    """Start on every third supported frame, drive by PD for three control steps, compare the root.
+def open_loop_gate(humanoid: HumanoidModel, clip: Motion, threads: int = 1, *, every_start: bool = False) -> GateResult:
+    """Start on every third feasible frame, drive by PD for three control steps, compare the root.
+
+    Feasible is a frame that :func:`egopose.data.reference.supported` finds on the floor or in flight, and whose
+    :func:`egopose.data.feasibility.contact_residual` is below a quarter of the body's weight: a clip is judged by
+    whether the body can follow what a body could have done. That is the motion's own inverse dynamics; no controller
+    has a say in it.
 
     The target of each step is the reference's joint angles at the frame to be reached plus 0.06 s of its joint
     velocities there. The root's reward is r_p = exp(-300 dh^2 - 75 theta^2), theta the true angle between the roots
@@ -92,6 +102,7 @@ def open_loop_gate(humanoid: HumanoidModel, clip: Motion, threads: int = 1) -> G
         humanoid: at the simulation rate to be judged.
         clip: a reference clip of :func:`egopose.data.prepare_motion.reference_motion`.
         threads: of the physics; the result does not depend on it.
+        every_start: start on supported frames that contact cannot have made too.
 
     Raises:
         ValueError: the clip is not on this humanoid at its control rate, or has no contacts.
@@ -100,13 +111,13 @@ def open_loop_gate(humanoid: HumanoidModel, clip: Motion, threads: int = 1) -> G
         raise ValueError("the clip has no contacts; make it with reference_motion")
     states = reference_states(humanoid, clip)
     qpos, qvel = states["qpos"].numpy(), states["qvel"].numpy()
-    feasible = supported(humanoid, states, clip.contacts, clip.fps)
-    starts = np.array(
-        [s for s in range(0, len(clip) - STEPS - 1, STRIDE) if feasible[s : s + STEPS + 1].all()], dtype=int
-    )
+    on_floor = supported(humanoid, states, clip.contacts, clip.fps)
+    feasible = on_floor & (contact_residual(humanoid, clip) < LARGEST_RESIDUAL)
+    good = on_floor if every_start else feasible
+    starts = np.array([s for s in range(0, len(clip) - STEPS - 1, STRIDE) if good[s : s + STEPS + 1].all()], dtype=int)
     if not len(starts):
         nothing = (float("nan"),) * STEPS
-        return GateResult(0, float(feasible.mean()), nothing, nothing, nothing)
+        return GateResult(0, float(on_floor.mean()), float(feasible.mean()), nothing, nothing, nothing)
     physics = BatchedPhysics(humanoid.mj_model, len(starts), humanoid.substeps, threads, body_ids=humanoid.body_ids)
     physics.set_state(np.arange(len(starts)), qpos[starts], qvel[starts])
     height, reward = np.empty((STEPS, len(starts))), np.empty((STEPS, len(starts)))
@@ -118,6 +129,7 @@ def open_loop_gate(humanoid: HumanoidModel, clip: Motion, threads: int = 1) -> G
     physics.close()
     return GateResult(
         len(starts),
+        float(on_floor.mean()),
         float(feasible.mean()),
         tuple(np.abs(height).mean(axis=1).tolist()),
         tuple(height.mean(axis=1).tolist()),
@@ -131,18 +143,21 @@ def _root_reward(qpos: Array, reference: Array) -> Array:
     return np.exp(-300.0 * (qpos[:, 2] - reference[:, 2]) ** 2 - 75.0 * np.sum(off**2, axis=1))
 
 
-def gate_sources(config: Mapping[str, Any], workers: int = 1) -> Iterator[tuple[str, GateResult]]:
+def gate_sources(
+    config: Mapping[str, Any], workers: int = 1, *, every_start: bool = False
+) -> Iterator[tuple[str, GateResult]]:
     """Name and result of every clip of a configuration's data set, in order.
 
     Args:
         config: resolved; groups ``data humanoid sim``.
         workers: processes.
+        every_start: see :func:`open_loop_gate`.
 
     Raises:
         InputError: a source cannot be used.
     """
     sources = find_sources(config["data"])
-    work = partial(_gate_source, json.dumps(config, default=str))
+    work = partial(_gate_source, json.dumps(config, default=str), every_start)
     if workers == 1:
         yield from zip((s.name for s in sources), map(work, sources), strict=True)
         return
@@ -157,14 +172,15 @@ def _parts(text: str) -> tuple[HumanoidModel, PreparationSettings]:
     return humanoid, PreparationSettings.from_mapping(config["data"].get("preparation") or {})
 
 
-def _gate_source(config: str, source: TakeSource) -> GateResult:
+def _gate_source(config: str, every_start: bool, source: TakeSource) -> GateResult:
     humanoid, settings = _parts(config)
     clip, _ = reference_motion(read_motion(source.motion, **source.options), humanoid, settings, source.mapping)
-    return open_loop_gate(humanoid, clip)
+    return open_loop_gate(humanoid, clip, every_start=every_start)
 
 
 HEADER = (
-    "| clip | starts | on floor | height error, cm (bias) | root reward r_p | |\n| --- | --- | --- | --- | --- | --- |"
+    "| clip | starts | on floor | feasible | height error, cm (bias) | root reward r_p | |\n"
+    "| --- | --- | --- | --- | --- | --- | --- |"
 )
 
 
@@ -175,7 +191,8 @@ def row(name: str, result: GateResult) -> str:
     )
     rewards = ", ".join(f"{r:.3f}" for r in result.root_reward)
     return (
-        f"| {name} | {result.starts} | {result.supported:.0%} | {errors}: mean {100 * result.mean_height_error:.2f} "
+        f"| {name} | {result.starts} | {result.supported:.0%} | {result.feasible:.0%} "
+        f"| {errors}: mean {100 * result.mean_height_error:.2f} "
         f"| {rewards}: mean {result.mean_root_reward:.3f} | {'' if result.passed else 'fails'} |"
     )
 
@@ -185,6 +202,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(prog="egopose.data.gate", description="Open-loop PD on every clip of a data set.")
     parser.add_argument("overrides", nargs="*", metavar="key=value", help="of the configuration, as for prepare")
     parser.add_argument("--json", action="store_true", help="a JSON object a clip, one a line")
+    parser.add_argument("--every-start", action="store_true", help="also from frames no contact can have made")
     parser.add_argument("--workers", type=int, default=1, help="processes")
     options = parser.parse_intermixed_args(arguments)
     try:
@@ -192,7 +210,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         results = []
         if not options.json:
             print(HEADER)
-        for name, result in gate_sources(config, options.workers):
+        for name, result in gate_sources(config, options.workers, every_start=options.every_start):
             results.append(result)
             print(json.dumps({"clip": name, **vars(result)}) if options.json else row(name, result), flush=True)
     except InputError as error:

@@ -27,7 +27,7 @@ from egopose.motion.retarget import RetargetReport
 
 #: Raise it whenever changed code gives another reference, video or flow for unchanged settings and sources: reading of
 #: motion files, retargeting, settling, making of the humanoid, rendering, optical flow. Stores are then made anew.
-PREPARATION_VERSION = 1
+PREPARATION_VERSION = 2
 
 
 def humanoid_of(config: Mapping[str, Any]) -> HumanoidModel:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from scipy.signal import butter, sosfiltfilt
 
+from egopose.data.reference import reference_states
 from egopose.humanoid.model import HumanoidModel
 from egopose.motion import rotations as rot
 from egopose.motion.motion import Motion
@@ -75,6 +76,19 @@ def sole_positions(humanoid: HumanoidModel, motion: Motion) -> Array:
     return np.stack(points, axis=1)
 
 
+def sole_edges(humanoid: HumanoidModel, motion: Motion) -> Array:
+    """``[T, feet * 4, 3]`` world positions (m) of the corners of every foot's sole."""
+    positions, quats = motion.forward_kinematics()
+    points = []
+    for foot in humanoid.feet:
+        geom = int(humanoid.mj_model.body_geomadr[humanoid.body_ids[foot]])
+        centre, half = humanoid.mj_model.geom_pos[geom], humanoid.mj_model.geom_size[geom]
+        for x, y in ((-1, -1), (-1, 1), (1, -1), (1, 1)):
+            corner = centre + half * [x, y, -1]
+            points.append(positions[:, foot] + rot.rotate(quats[:, foot], corner[None]))
+    return np.stack(points, axis=1)
+
+
 def sole_names(humanoid: HumanoidModel) -> tuple[str, ...]:
     """Names of the points of :func:`sole_positions`."""
     return tuple(f"{humanoid.skeleton.names[f]}_{end}" for f in humanoid.feet for end in ("heel", "ball"))
@@ -110,7 +124,13 @@ def reference_motion(
         retargeted = low_pass(retargeted, settings.cutoff_hz)
     clip = retargeted.resample(fps)
     clip = replace(clip, contact_names=sole_names(humanoid), contacts=None)
-    clip, shift = settle(clip, sole_positions(humanoid, clip), settings.settle)
+    clip, shift = settle(
+        clip,
+        sole_positions(humanoid, clip),
+        settings.settle,
+        sole_edges=sole_edges(humanoid, clip),
+        center_of_mass=reference_states(humanoid, clip)["com"].numpy(),
+    )
     clip = plant_feet(
         clip,
         np.repeat(humanoid.feet, humanoid.sole_points.shape[1]),

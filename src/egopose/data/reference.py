@@ -54,6 +54,21 @@ def reference_states(humanoid: HumanoidModel, motion: Motion) -> TensorDict:
     return TensorDict({k: torch.from_numpy(np.ascontiguousarray(v)) for k, v in arrays.items()}, batch_size=[frames])
 
 
+def falls_freely(com: np.ndarray, fps: float, window: float = 0.1) -> np.ndarray:
+    """Frames ``[T]`` in which the centre of mass ``[T, 3]`` (m) accelerates downwards by half of gravity or more.
+
+    Args:
+        com: of a clip.
+        fps: frames per second.
+        window: s either side over which the acceleration is averaged.
+    """
+    reach = max(1, round(window * fps))
+    kernel = np.ones(2 * reach + 1) / (2 * reach + 1)
+    height = com[:, 2]
+    acceleration = np.gradient(np.gradient(height)) * fps**2 if len(height) > 1 else np.zeros(1)
+    return np.convolve(np.pad(acceleration, reach, mode="edge"), kernel, mode="valid") < -0.5 * 9.81
+
+
 def supported(humanoid: HumanoidModel, states: TensorDict, contacts: np.ndarray, fps: float) -> np.ndarray:
     """Frames ``[T]`` a body on a bare floor could be in: a sole touches it, or the body really falls freely.
 

@@ -1,8 +1,10 @@
-"""From a skeleton to a simulated humanoid: MJCF by ``dm_control.mjcf``, PD by MuJoCo's own implicit actuators.
+"""From a skeleton to a simulated humanoid: MJCF by ``dm_control.mjcf``, stable PD by MuJoCo's own actuators.
 
 Frames: z up, x forward, y left; at zero joint angles the body stands upright with its arms held out sideways.
-The actuators are affine, ``torque = kp (target - angle) - (kd + kp h) velocity``, integrated with ``implicitfast``;
-the extra ``kp h`` damping (h: the physics step) makes them equal stable PD (Tan et al. 2011).
+The actuators are affine, ``torque = kp (target - angle) - (kd + kp h) velocity``, and the joints' armature carries
+``kd h`` more than their own (h: the physics step). With the semi-implicit Euler integrator this is stable PD as
+published (Tan et al. 2011, eqs. 9-11), and MuJoCo's contact solver sees it: with the implicit integrators the damping
+is added after the contact forces are found, and a standing body sinks (docs/physics-gate.md).
 """
 
 from __future__ import annotations
@@ -95,10 +97,10 @@ def build_humanoid(config: HumanoidConfig, sim: SimConfig | None = None) -> Huma
             gainprm=[p],
             biasprm=[0.0, -p, -(d + p * sim.timestep)],
         )
-        # The limit sits on the joint. On the actuator MuJoCo would drop the implicit damping while it holds, and a
-        # light limb at 150 Hz then diverges: in 378 of 64 x 60 control steps with noisy targets, in none this way.
+        # The limit sits on the joint, where it clips the torque and leaves the armature's share of the damping alone.
         hinge = root.find("joint", name)
         hinge.actuatorfrclimited, hinge.actuatorfrcrange = True, [-limit, limit]
+        hinge.armature = config.armature + d * sim.timestep
     xml = root.to_xml_string()
     model = mujoco.MjModel.from_xml_string(xml)
     index = {row.name: i for i, row in enumerate(rows)}
@@ -140,14 +142,13 @@ def _document(config: HumanoidConfig, sim: SimConfig) -> mjcf.RootElement:
     root.compiler.angle = "radian"
     root.compiler.autolimits = True
     root.option.timestep = sim.timestep
-    root.option.integrator = "implicitfast"
+    root.option.integrator = "Euler"
     root.option.iterations = sim.solver_iterations
     root.option.tolerance = sim.tolerance
     root.default.geom.contype = _BODY_BIT
     root.default.geom.conaffinity = _FLOOR_BIT
     root.default.geom.friction = config.friction
     root.default.geom.rgba = [0.55, 0.62, 0.75, 1.0]
-    root.default.joint.armature = config.armature
     root.default.joint.limited = True
     root.asset.add("texture", name="grid", type="2d", builtin="checker", width=256, height=256,
                    rgb1=[0.32, 0.35, 0.38], rgb2=[0.42, 0.45, 0.48])  # fmt: skip

@@ -9,12 +9,16 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.ndimage import gaussian_filter1d, maximum_filter1d, minimum_filter1d
+from numpy.typing import NDArray
+from scipy import sparse
+from scipy.ndimage import gaussian_filter1d, minimum_filter1d
 
 from egopose.motion.contacts import contact_labels
 from egopose.motion.ground import ground_height
 from egopose.motion.motion import Motion
 from egopose.motion.rotations import Array
+
+GRAVITY = 9.81
 
 
 @dataclass(frozen=True)
@@ -26,7 +30,9 @@ class SettleSettings:
         contact_height: a sole point at or below this touches the floor, m.
         contact_speed: ... if it is no faster than this, m/s.
         stride: a sole comes down at least once in so long, s; slower changes of the floor's height are taken out.
-        smoothing: standard deviation in time of the correction, s.
+        tolerance: scale of a standing sole's distance from the floor, m.
+        shift_acceleration: scale of the shift's own acceleration, m/s^2.
+        flight_acceleration: scale of what the centre of mass's acceleration in flight differs from gravity by, m/s^2.
         depth: how far soles rest in the floor, m: what the simulation's soft contact gives under a standing body.
         largest: the correction's bound, m; more means that the clip stands on something that is not the floor.
     """
@@ -35,18 +41,30 @@ class SettleSettings:
     contact_height: float = 0.03
     contact_speed: float = 0.5
     stride: float = 1.2
-    smoothing: float = 0.08
+    tolerance: float = 0.003
+    shift_acceleration: float = 4.0
+    flight_acceleration: float = 1.5
     depth: float = 0.004
     largest: float = 0.08
 
 
-def settle(motion: Motion, sole_points: Array, settings: SettleSettings | None = None) -> tuple[Motion, Array]:
+def settle(
+    motion: Motion,
+    sole_points: Array,
+    settings: SettleSettings | None = None,
+    *,
+    sole_edges: Array | None = None,
+    center_of_mass: Array | None = None,
+) -> tuple[Motion, Array]:
     """The motion with its root moved up and down so that soles rest on the floor.
 
     Args:
         motion: any.
         sole_points: ``[T, K, 3]`` world positions of heels and balls of the feet, m.
         settings: see :class:`SettleSettings`.
+        sole_edges: ``[T, E, 3]`` the soles' corners, m; default the sole points. A foot on its edge stands on these.
+        center_of_mass: ``[T, 3]`` m. With it, a body near the floor that does not fall stands on the floor even where
+            no sole point is slow enough to touch, and a body in the air falls as gravity has it.
 
     Returns:
         The motion, with ``contacts [T, K]`` of its sole points; and the vertical shift of every frame ``[T]``, m.
@@ -60,21 +78,55 @@ def settle(motion: Motion, sole_points: Array, settings: SettleSettings | None =
     floor = base + np.clip(drift, -settings.largest, settings.largest)
     points = sole_points - np.stack([np.zeros_like(floor), np.zeros_like(floor), floor], axis=1)[:, None]
     touching = contact_labels(points, motion.fps, height=settings.contact_height, speed=settings.contact_speed)
-    # While a foot stands, its lowest touching point belongs at z = 0; in between the correction is interpolated.
-    standing = touching.any(axis=1)
-    lowest = np.where(touching, points[..., 2], np.inf).min(axis=1)
-    shift = np.zeros(len(motion))
-    if standing.any():
-        at = np.flatnonzero(standing)
-        shift = np.interp(np.arange(len(motion)), at, -np.clip(lowest[at], -settings.largest, settings.largest))
-    sigma = settings.smoothing * motion.fps
-    shift = gaussian_filter1d(shift, sigma, mode="nearest")
-    # What still sinks is lifted by a smooth envelope that lies above every single lift.
-    sunk = np.clip(-(points[..., 2].min(axis=1) + shift), 0.0, settings.largest)
-    reach = max(1, round(2 * sigma))
-    shift = shift + gaussian_filter1d(maximum_filter1d(sunk, 2 * reach + 1, mode="nearest"), sigma / 2, mode="nearest")
+    edges = (points if sole_edges is None else sole_edges - (sole_points - points)[:, :1])[..., 2].min(axis=1)
+    com_height = None if center_of_mass is None else center_of_mass[:, 2] - floor
+    shift = _contact_shift(edges, touching.any(axis=1), com_height, motion.fps, settings)
     shift = shift - floor - settings.depth
     qpos = motion.qpos.copy()
     qpos[:, 2] += shift
     names = motion.contact_names or tuple(f"sole_{k}" for k in range(points.shape[1]))
     return replace(motion, qpos=qpos, contacts=touching, contact_names=names), shift
+
+
+def _contact_shift(
+    edges: Array, touching: NDArray[np.bool_], com_height: Array | None, fps: float, settings: SettleSettings
+) -> Array:
+    """``[T]`` m: the upward shift s that puts soles on the floor, by least squares over the whole clip.
+
+    The residuals, each over its own scale: a standing sole's height above the floor; any sole's depth under it; s's
+    acceleration; in flight, the centre of mass's acceleration less gravity's.
+    """
+    frames = len(edges)
+    if frames < 3:
+        return -edges if touching.any() else np.maximum(-edges, 0.0)
+    one = np.full(frames - 2, fps**2)
+    second = sparse.diags_array([one, -2 * one, one], offsets=[0, 1, 2], shape=(frames - 2, frames)).tocsr()
+    standing, flying = touching, np.zeros(frames, dtype=bool)
+    free = np.zeros(frames - 2)
+    if com_height is not None:
+        free = second @ com_height + GRAVITY
+        falling = np.concatenate([free[:1], free, free[-1:]]) < 0.5 * GRAVITY
+        standing = touching | (~falling & (edges < settings.largest))
+        flying = falling & ~standing
+    rows = [second / settings.shift_acceleration]
+    values = [np.zeros(frames - 2)]
+    inner = flying[1:-1]
+    rows.append(second[inner] / settings.flight_acceleration)
+    values.append(-free[inner] / settings.flight_acceleration)
+    stand = sparse.eye_array(frames, format="csr")[standing] / settings.tolerance
+    rows.append(stand)
+    values.append(-edges[standing] / settings.tolerance)
+    base, target = sparse.vstack(rows), np.concatenate(values)
+    normal, right = base.T @ base, base.T @ target
+    normal = normal + sparse.eye_array(frames) * 1e-6
+    # What is under the floor pushes up, what is not does not: the set of such frames settles in a few rounds.
+    shift = np.zeros(frames)
+    under = edges < 0
+    for _ in range(20):
+        weight = under / settings.tolerance**2
+        shift = sparse.linalg.spsolve((normal + sparse.diags_array(weight)).tocsc(), right - weight * edges)
+        now = edges + shift < 0
+        if (now == under).all():
+            break
+        under = now
+    return np.clip(shift, -settings.largest, settings.largest)
