@@ -113,12 +113,12 @@ class EgoPoseEnv(EnvBase):
             episodes = self.starts(worlds, self._generator)
             self._take[worlds], self._start[worlds], self._stop[worlds] = episodes.take, episodes.start, episodes.stop
             self._frame[worlds] = episodes.start
-            reference = self.problem.reference_at(episodes.start)
-            qpos, qvel = reference["qpos"], reference["qvel"]
             if tensordict is not None and "initial_qpos" in tensordict:
                 qpos, qvel = tensordict["initial_qpos"][worlds], tensordict["initial_qvel"][worlds]
+            else:
+                qpos, qvel = self.problem.first_state(episodes.start)
             self.place(worlds, qpos, qvel)
-        return self._observe(self.body_state())
+        return self.observe()
 
     def place(self, worlds: Tensor, qpos: Tensor, qvel: Tensor) -> None:
         """Put ``worlds [n]`` at ``qpos [n, 59]`` and ``qvel [n, 58]`` without touching their time or episode.
@@ -132,22 +132,17 @@ class EgoPoseEnv(EnvBase):
 
     def observe(self) -> TensorDict:
         """The present observation of all worlds, as a reset would return it (after :meth:`place`)."""
-        return self._observe(self.body_state())
-
-    def _observe(self, state: TensorDictBase) -> TensorDict:
         n = self.batch_size[0]
-        no = torch.zeros(n, 1, dtype=torch.bool)
+        flags = ("fallen", "diverged", "done", "terminated", "truncated")
         terms = {k: torch.zeros(n, 1) for k in self.problem.reward.names}
+        # The state z needs no kinematics; the copy that it is of the simulation's memory is made in it.
+        moving = {"qpos": torch.from_numpy(self.physics.qpos), "qvel": torch.from_numpy(self.physics.qvel)}
         return TensorDict(
             {
                 **self._clock(),
-                "humanoid_state": self.problem.observation(state).float(),
+                "humanoid_state": self.problem.observation(moving).float(),
                 "reward_terms": TensorDict(terms, batch_size=self.batch_size),
-                "fallen": no,
-                "diverged": no.clone(),
-                "done": no.clone(),
-                "terminated": no.clone(),
-                "truncated": no.clone(),
+                **{k: torch.zeros(n, 1, dtype=torch.bool) for k in flags},
             },
             batch_size=self.batch_size,
         )
@@ -165,20 +160,20 @@ class EgoPoseEnv(EnvBase):
         self._frame = torch.minimum(self._frame + 1, self._stop - 1)
         target = self.problem.target(tensordict["action"].detach(), self._frame)
         diverged = torch.from_numpy(self.physics.step(target.numpy()).copy())
-        state = self.body_state()
+        state = self.problem.view({k: torch.from_numpy(v) for k, v in self.physics.body_state().items()})
         reward, terms = self.problem.rewards(state, self._frame, self._frame - self._start)
         fallen = self.problem.fallen(state, self._take)
-        sound = ~diverged
-        terminated = diverged | (fallen if self.problem.termination.enabled else torch.zeros_like(fallen))
+        terminated = diverged | fallen if self.problem.termination.enabled else diverged
         truncated = (self._frame >= self._stop - 1) & ~terminated
+        # One tensor for all: a diverged world earns nothing.
+        earned = torch.stack([reward, *terms.values()], dim=-1) * ~diverged[:, None]
+        columns = earned.float().split(1, dim=-1)
         return TensorDict(
             {
                 **self._clock(),
                 "humanoid_state": self.problem.observation(state).float(),
-                "reward": (reward * sound).float()[:, None],
-                "reward_terms": TensorDict(
-                    {k: (v * sound).float()[:, None] for k, v in terms.items()}, batch_size=self.batch_size
-                ),
+                "reward": columns[0],
+                "reward_terms": TensorDict(dict(zip(terms, columns[1:], strict=True)), batch_size=self.batch_size),
                 "fallen": fallen[:, None],
                 "diverged": diverged[:, None],
                 "terminated": terminated[:, None],

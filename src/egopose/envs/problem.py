@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from types import SimpleNamespace
 from typing import TYPE_CHECKING
 
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
-from egopose.envs.mdp import observations as obs
 from egopose.envs.mdp import terminations
-from egopose.envs.mdp.rewards import BodyLayout, Reward
+from egopose.envs.mdp.observations import BodyLayout, BodyState, BodyView
+from egopose.envs.mdp.rewards import Reward
 
 if TYPE_CHECKING:
     from egopose.humanoid.model import HumanoidModel
@@ -106,12 +107,15 @@ class ImitationProblem:
         self.action, self.termination = action, termination
         self.n_frames = reference.shape[0]
         self.reference = reference
-        # Plain tensors: indexing them costs a third of indexing the (memory-mapped) TensorDict each step.
-        self._reference = {k: torch.as_tensor(reference[k]).to(torch.float64) for k in BODY_KEYS}
         self.layout = BodyLayout(
             torch.as_tensor(humanoid.joint_parent, dtype=torch.int64),
             torch.as_tensor(humanoid.end_effectors, dtype=torch.int64),
         )
+        # Plain tensors of what is looked up at every step or reset; what the reward reads of the reference is worked
+        # out once.
+        whole = BodyView(self.reference_at(torch.arange(self.n_frames)), self.layout)
+        self._qpos, self._qvel = whole.qpos, whole.qvel
+        self._rewarded = {name: getattr(whole, name).contiguous() for name in reward.reads}
         self._range = torch.as_tensor(humanoid.joint_range, dtype=torch.float64).T
         self._rest = torch.as_tensor(humanoid.rest_action, dtype=torch.float64)
         self._table: Tensor | None = None
@@ -135,22 +139,34 @@ class ImitationProblem:
 
     def reference_at(self, frame: Tensor) -> TensorDict:
         """Body states ``[N]`` of the reference at global frames ``[N]``."""
-        return TensorDict({k: v[frame] for k, v in self._reference.items()}, batch_size=frame.shape)
+        return TensorDict(
+            {k: torch.as_tensor(self.reference[k][frame]).to(torch.float64) for k in BODY_KEYS}, batch_size=frame.shape
+        )
+
+    def first_state(self, frame: Tensor) -> tuple[Tensor, Tensor]:
+        """The reference's ``qpos [n, nq]`` and ``qvel [n, nv]`` at global frames ``[n]``, where episodes begin."""
+        return self._qpos[frame], self._qvel[frame]
+
+    def view(self, state: BodyState | BodyView) -> BodyView:
+        """``state`` and what follows from it; the functions below take either, and share the work given a view."""
+        return state if isinstance(state, BodyView) else BodyView(state, self.layout)
 
     def target(self, action: Tensor, frame: Tensor) -> Tensor:
         """PD targets ``[N, nu]`` rad from actions ``[N, nu]``, for reaching frames ``[N]``; within joint range."""
         base = self._rest if self._table is None else self._table[frame]
         return torch.clamp(base + self.action.scale * action.to(torch.float64), self._range[0], self._range[1])
 
-    def observation(self, state: TensorDictBase) -> Tensor:
+    def observation(self, state: BodyState | BodyView) -> Tensor:
         """The humanoid state ``[N, 115]``, float64."""
-        return obs.humanoid_state(state)
+        return self.view(state).humanoid_state
 
-    def rewards(self, state: TensorDictBase, frame: Tensor, step: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
+    def rewards(self, state: BodyState | BodyView, frame: Tensor, step: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
         """Reward ``[N]`` and its terms for states at global frames ``[N]``, ``step [N]`` steps into the episode."""
-        return self.reward(state, self.reference_at(frame), self.layout, step)
+        reference = SimpleNamespace(**{name: table[frame] for name, table in self._rewarded.items()})
+        return self.reward(self.view(state), reference, step)
 
-    def fallen(self, state: TensorDictBase, take: Tensor) -> Tensor:
+    def fallen(self, state: BodyState | BodyView, take: Tensor) -> Tensor:
         """``[N]``: the head is too low for ``take [N]``, whether or not that ends the episode."""
         lowest = self.takes.lowest_head_height[take]
-        return terminations.fallen(state, int(self.humanoid.head), lowest, self.termination.head_drop)
+        head = self.view(state).xpos[:, self.humanoid.head, 2]
+        return terminations.fallen(head, lowest, self.termination.head_drop)

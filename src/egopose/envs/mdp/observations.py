@@ -1,6 +1,11 @@
-"""What the policy sees of the body: the humanoid state z of Yuan & Kitani 2019, section 3."""
+"""What the policy and the rewards see of the body: the humanoid state z of Yuan & Kitani 2019, section 3."""
 
 from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TypeAlias
 
 import torch
 from tensordict import TensorDictBase
@@ -8,44 +13,126 @@ from torch import Tensor
 
 from egopose.envs.mdp import rotations as rot
 
-
-def root_linear_velocity(state: TensorDictBase) -> Tensor:
-    """``[N, 3]`` m/s in the heading frame."""
-    return rot.rotate(rot.conjugate(rot.heading(state["qpos"][:, 3:7])), state["qvel"][:, :3])
+BodyState: TypeAlias = TensorDictBase | Mapping[str, Tensor]
 
 
-def root_angular_velocity(state: TensorDictBase) -> Tensor:
-    """``[N, 3]`` rad/s in the heading frame. MuJoCo's ``qvel[3:6]`` is in the root frame."""
-    return rot.rotate(rot.dehead(state["qpos"][:, 3:7]), state["qvel"][:, 3:6])
+@dataclass(frozen=True)
+class BodyLayout:
+    """Which bodies the rewards look at.
+
+    Args:
+        parents: ``[J]`` index of the parent of every body but the root.
+        end_effectors: ``[E]`` indices of hands, feet and head.
+    """
+
+    parents: Tensor
+    end_effectors: Tensor
 
 
-def end_effectors(state: TensorDictBase, bodies: Tensor) -> Tensor:
-    """``[N, E, 3]`` m: vectors from the root to each of ``bodies [E]``, in the heading frame."""
-    vectors = state["xpos"][:, bodies] - state["qpos"][:, None, :3]
-    return rot.rotate(rot.conjugate(rot.heading(state["qpos"][:, 3:7]))[:, None], vectors)
+class BodyView:
+    """A body state and what follows from it, each worked out once, when first asked for.
+
+    Args:
+        state: body state, batch ``[N]``.
+        layout: needed by :attr:`joint_rotations`, :attr:`end_effectors` and :attr:`end_effector_positions`.
+    """
+
+    def __init__(self, state: BodyState, layout: BodyLayout | None = None) -> None:
+        self.qpos, self.qvel = state["qpos"], state["qvel"]
+        self._state, self._layout = state, layout
+
+    @property
+    def layout(self) -> BodyLayout:
+        """Raises ValueError: made without one."""
+        if self._layout is None:
+            raise ValueError("this view of the body was made without a layout")
+        return self._layout
+
+    @property
+    def xpos(self) -> Tensor:
+        """``[N, B, 3]`` m, of the bodies in the world."""
+        return self._state["xpos"]
+
+    @cached_property
+    def root_height(self) -> Tensor:
+        """``[N]`` m."""
+        return self.qpos[:, 2]
+
+    @cached_property
+    def root_quaternion(self) -> Tensor:
+        """``[N, 4]`` in the world."""
+        return self.qpos[:, 3:7]
+
+    @cached_property
+    def heading(self) -> Tensor:
+        """``[N, 4]``, see :func:`rotations.heading`."""
+        return rot.heading(self.root_quaternion)
+
+    @cached_property
+    def heading_matrix(self) -> Tensor:
+        """``[N, 3, 3]``: a row vector of the world times it is in the heading frame."""
+        return rot.matrix(self.heading)
+
+    @cached_property
+    def root_rotation(self) -> Tensor:
+        """``[N, 4]`` de-headed, ``conj(heading) * q``: w is never negative, z is zero, whichever sign q comes with."""
+        return rot.multiply(rot.conjugate(self.heading), self.root_quaternion)
+
+    @cached_property
+    def root_linear_velocity(self) -> Tensor:
+        """``[N, 3]`` m/s in the heading frame."""
+        return torch.matmul(self.qvel[:, None, :3], self.heading_matrix).squeeze(1)
+
+    @cached_property
+    def root_angular_velocity(self) -> Tensor:
+        """``[N, 3]`` rad/s in the heading frame. MuJoCo's ``qvel[3:6]`` is in the root frame."""
+        return torch.matmul(rot.matrix(self.root_rotation), self.qvel[:, 3:6, None]).squeeze(-1)
+
+    @cached_property
+    def joint_velocities(self) -> Tensor:
+        """``[N, nu]`` rad/s."""
+        return self.qvel[:, 6:]
+
+    @cached_property
+    def joint_rotations(self) -> Tensor:
+        """``[N, J, 4]``: each body but the root relative to its parent, ``conj(xquat[parent]) * xquat[child]``."""
+        quats = self._state["xquat"]
+        return rot.multiply(rot.conjugate(quats.index_select(1, self.layout.parents)), quats[:, 1:])
+
+    @cached_property
+    def end_effector_positions(self) -> Tensor:
+        """``[N, E, 3]`` m in the world."""
+        return self.xpos.index_select(1, self.layout.end_effectors)
+
+    @cached_property
+    def end_effectors(self) -> Tensor:
+        """``[N, E, 3]`` m: vectors from the root to each end effector, in the heading frame."""
+        return torch.matmul(self.end_effector_positions - self.qpos[:, None, :3], self.heading_matrix)
+
+    @cached_property
+    def centre_of_mass(self) -> Tensor:
+        """``[N, 3]`` m in the world."""
+        return self._state["com"]
+
+    @cached_property
+    def humanoid_state(self) -> Tensor:
+        """See :func:`humanoid_state`."""
+        return torch.cat(
+            [
+                self.qpos[:, 2:3],
+                self.root_rotation,
+                self.qpos[:, 7:],
+                self.root_linear_velocity,
+                self.qvel[:, 3:],
+            ],
+            dim=-1,
+        )
 
 
-def joint_rotations(state: TensorDictBase, parents: Tensor) -> Tensor:
-    """``[N, J, 4]``: each body but the root relative to its parent, ``conj(xquat[parent]) * xquat[child]``."""
-    quats = state["xquat"]
-    return rot.multiply(rot.conjugate(quats[:, parents]), quats[:, 1:])
-
-
-def humanoid_state(state: TensorDictBase) -> Tensor:
+def humanoid_state(state: BodyState) -> Tensor:
     """z ``[N, 2 nq - 3]`` (115 numbers at 58 degrees of freedom), float64.
 
     In order: root height 1, de-headed root quaternion 4, joint angles, root linear velocity in the heading frame 3,
     root angular velocity in the root frame 3, joint velocities (Yuan & Kitani 2019, section 3, "State").
     """
-    qpos, qvel = state["qpos"], state["qvel"]
-    return torch.cat(
-        [
-            qpos[:, 2:3],
-            rot.dehead(qpos[:, 3:7]),
-            qpos[:, 7:],
-            root_linear_velocity(state),
-            qvel[:, 3:6],
-            qvel[:, 6:],
-        ],
-        dim=-1,
-    )
+    return BodyView(state).humanoid_state

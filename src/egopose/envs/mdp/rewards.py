@@ -4,31 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Protocol
+from types import SimpleNamespace
+from typing import Any, Protocol, TypeAlias
 
 import torch
-from tensordict import TensorDictBase
 from torch import Tensor
 
-from egopose.envs.mdp import observations as obs
 from egopose.envs.mdp import rotations as rot
+from egopose.envs.mdp.observations import BodyView
+
+#: A view, or a reference's rows of a table of some of a view's attributes.
+BodyLike: TypeAlias = BodyView | SimpleNamespace
 
 
-@dataclass(frozen=True)
-class BodyLayout:
-    """Which bodies a reward looks at.
-
-    Args:
-        parents: ``[J]`` index of the parent of every body but the root.
-        end_effectors: ``[E]`` indices of hands, feet and head.
-    """
-
-    parents: Tensor
-    end_effectors: Tensor
-
-
-def rotation_size(q: Tensor, metric: str) -> Tensor:
-    """``[...]`` size of rotations ``q [..., 4]``, the short way round.
+def rotation_distance(p: Tensor, q: Tensor, metric: str) -> Tensor:
+    """``[...]`` size of the rotation ``p * conj(q)`` between unit quaternions ``[..., 4]``, the short way round.
 
     ``half_angle`` is arccos(w), the authors' measure, with which their published numbers were made; ``angle`` is twice
     that, the true angle.
@@ -38,38 +28,38 @@ def rotation_size(q: Tensor, metric: str) -> Tensor:
     """
     if metric not in ("half_angle", "angle"):
         raise ValueError(f"rotation_metric must be half_angle or angle, not {metric!r}")
-    half = rot.half_angle(q)
+    half = rot.half_angle_between(p, q)
     return half if metric == "half_angle" else 2.0 * half
 
 
-def _difference(a: Tensor, b: Tensor, metric: str) -> Tensor:
-    return rotation_size(rot.multiply(a, rot.conjugate(b)), metric)
+def _squares(a: Tensor, b: Tensor) -> Tensor:
+    """``[N]``: the squared length of ``a - b`` over all axes but the first."""
+    return (a - b).flatten(1).square().sum(-1)
 
 
-def pose(state: TensorDictBase, reference: TensorDictBase, parents: Tensor, scale: float, metric: str) -> Tensor:
+def pose(body: BodyLike, reference: BodyLike, scale: float, metric: str) -> Tensor:
     """r_q = exp(-scale sum_j |q_j - q^_j|^2) over the joints' local rotations ``[N]`` (equation 3, scale 2)."""
-    size = _difference(obs.joint_rotations(state, parents), obs.joint_rotations(reference, parents), metric)
+    size = rotation_distance(body.joint_rotations, reference.joint_rotations, metric)
     return torch.exp(-scale * size.square().sum(-1))
 
 
-def end_effector(state: TensorDictBase, reference: TensorDictBase, bodies: Tensor, scale: float) -> Tensor:
+def end_effector(body: BodyLike, reference: BodyLike, scale: float) -> Tensor:
     """r_e = exp(-scale sum_e |e - e^|^2), vectors from the root in the heading frame ``[N]`` (equation 4, scale 20)."""
-    difference = obs.end_effectors(state, bodies) - obs.end_effectors(reference, bodies)
-    return torch.exp(-scale * difference.square().sum((-1, -2)))
+    return torch.exp(-scale * _squares(body.end_effectors, reference.end_effectors))
 
 
-def root_pose(state: TensorDictBase, reference: TensorDictBase, scale: float, metric: str) -> Tensor:
+def root_pose(body: BodyLike, reference: BodyLike, scale: float, metric: str) -> Tensor:
     """r_p = exp(-scale ((h - h^)^2 + |q_r - q^_r|^2)), root rotations de-headed ``[N]`` (equation 5, scale 300)."""
-    height = state["qpos"][:, 2] - reference["qpos"][:, 2]
-    size = _difference(rot.dehead(state["qpos"][:, 3:7]), rot.dehead(reference["qpos"][:, 3:7]), metric)
+    height = body.root_height - reference.root_height
+    size = rotation_distance(body.root_rotation, reference.root_rotation, metric)
     return torch.exp(-scale * (height.square() + size.square()))
 
 
-def root_velocity(state: TensorDictBase, reference: TensorDictBase, linear: float, angular: float) -> Tensor:
+def root_velocity(body: BodyLike, reference: BodyLike, linear: float, angular: float) -> Tensor:
     """r_v = exp(-linear |l - l^|^2 - angular |w - w^|^2), heading frame ``[N]`` (equation 6, scales 1 and 0.1)."""
-    dl = obs.root_linear_velocity(state) - obs.root_linear_velocity(reference)
-    dw = obs.root_angular_velocity(state) - obs.root_angular_velocity(reference)
-    return torch.exp(-linear * dl.square().sum(-1) - angular * dw.square().sum(-1))
+    dl = _squares(body.root_linear_velocity, reference.root_linear_velocity)
+    dw = _squares(body.root_angular_velocity, reference.root_angular_velocity)
+    return torch.exp(-linear * dl - angular * dw)
 
 
 def forecasting_decay(step: Tensor, horizon: int) -> Tensor:
@@ -77,32 +67,35 @@ def forecasting_decay(step: Tensor, horizon: int) -> Tensor:
     return ((horizon - step) / horizon).clamp_min(0.0)
 
 
-def world_pose(state: TensorDictBase, reference: TensorDictBase, parents: Tensor, scale: float, metric: str) -> Tensor:
+def world_pose(body: BodyLike, reference: BodyLike, scale: float, metric: str) -> Tensor:
     """DeepMimic's r^p = exp(-2 sum_j |q_j - q^_j|^2), the root's world rotation among the joints ``[N]``."""
-    joints = _difference(obs.joint_rotations(state, parents), obs.joint_rotations(reference, parents), metric)
-    root = _difference(state["qpos"][:, 3:7], reference["qpos"][:, 3:7], metric)
+    joints = rotation_distance(body.joint_rotations, reference.joint_rotations, metric)
+    root = rotation_distance(body.root_quaternion, reference.root_quaternion, metric)
     return torch.exp(-scale * (joints.square().sum(-1) + root.square()))
 
 
-def joint_velocity(state: TensorDictBase, reference: TensorDictBase, scale: float) -> Tensor:
+def joint_velocity(body: BodyLike, reference: BodyLike, scale: float) -> Tensor:
     """DeepMimic's r^v = exp(-0.1 sum_j |q'_j - q^'_j|^2) over the joints' velocities ``[N]``."""
-    return torch.exp(-scale * (state["qvel"][:, 6:] - reference["qvel"][:, 6:]).square().sum(-1))
+    return torch.exp(-scale * _squares(body.joint_velocities, reference.joint_velocities))
 
 
-def world_end_effector(state: TensorDictBase, reference: TensorDictBase, bodies: Tensor, scale: float) -> Tensor:
+def world_end_effector(body: BodyLike, reference: BodyLike, scale: float) -> Tensor:
     """DeepMimic's r^e = exp(-40 sum_e |p_e - p^_e|^2), world positions ``[N]``."""
-    return torch.exp(-scale * (state["xpos"][:, bodies] - reference["xpos"][:, bodies]).square().sum((-1, -2)))
+    return torch.exp(-scale * _squares(body.end_effector_positions, reference.end_effector_positions))
 
 
-def centre_of_mass(state: TensorDictBase, reference: TensorDictBase, scale: float) -> Tensor:
+def centre_of_mass(body: BodyLike, reference: BodyLike, scale: float) -> Tensor:
     """DeepMimic's r^c = exp(-10 |p_c - p^_c|^2), world positions ``[N]``."""
-    return torch.exp(-scale * (state["com"] - reference["com"]).square().sum(-1))
+    return torch.exp(-scale * _squares(body.centre_of_mass, reference.centre_of_mass))
 
 
 def weighted_mean(terms: Mapping[str, Tensor], weights: Mapping[str, float]) -> Tensor:
     """``[N]``: the weighted sum of the terms over the sum of the weights (equation 2, kept within [0, 1])."""
     total = sum(weights.values())
-    return torch.stack([terms[k] * (w / total) for k, w in weights.items()]).sum(0)
+    mean = torch.zeros_like(next(iter(terms.values())))
+    for name, weight in weights.items():
+        mean = torch.add(mean, terms[name], alpha=weight / total)
+    return mean
 
 
 class Reward(Protocol):
@@ -113,9 +106,12 @@ class Reward(Protocol):
         """Names of the terms."""
         ...
 
-    def __call__(
-        self, state: TensorDictBase, reference: TensorDictBase, layout: BodyLayout, step: Tensor
-    ) -> tuple[Tensor, dict[str, Tensor]]:
+    @property
+    def reads(self) -> tuple[str, ...]:
+        """Attributes of :class:`BodyView` it reads of body and reference."""
+        ...
+
+    def __call__(self, body: BodyLike, reference: BodyLike, step: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
         """The reward ``[N]`` at ``step [N]`` of the episode, and its terms ``[N]`` by name."""
         ...
 
@@ -147,19 +143,25 @@ class HeadingFrameReward:
     rotation_metric: str = "half_angle"
     decay_horizon: int | None = None
     names = ("pose", "end_effector", "root_pose", "root_velocity")
+    reads = (
+        "joint_rotations",
+        "end_effectors",
+        "root_height",
+        "root_rotation",
+        "root_linear_velocity",
+        "root_angular_velocity",
+    )
 
     def __post_init__(self) -> None:
         _check_weights(self.weights, self.names)
 
-    def __call__(
-        self, state: TensorDictBase, reference: TensorDictBase, layout: BodyLayout, step: Tensor
-    ) -> tuple[Tensor, dict[str, Tensor]]:
+    def __call__(self, body: BodyLike, reference: BodyLike, step: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
         s, metric = self.scales, self.rotation_metric
         terms = {
-            "pose": pose(state, reference, layout.parents, s["pose"], metric),
-            "end_effector": end_effector(state, reference, layout.end_effectors, s["end_effector"]),
-            "root_pose": root_pose(state, reference, s["root_pose"], metric),
-            "root_velocity": root_velocity(state, reference, s["root_linear_velocity"], s["root_angular_velocity"]),
+            "pose": pose(body, reference, s["pose"], metric),
+            "end_effector": end_effector(body, reference, s["end_effector"]),
+            "root_pose": root_pose(body, reference, s["root_pose"], metric),
+            "root_velocity": root_velocity(body, reference, s["root_linear_velocity"], s["root_angular_velocity"]),
         }
         total = weighted_mean(terms, self.weights)
         if self.decay_horizon is not None:
@@ -183,19 +185,18 @@ class WorldFrameReward:
     scales: Mapping[str, float]
     rotation_metric: str = "angle"
     names = ("pose", "velocity", "end_effector", "centre_of_mass")
+    reads = ("joint_rotations", "root_quaternion", "joint_velocities", "end_effector_positions", "centre_of_mass")
 
     def __post_init__(self) -> None:
         _check_weights(self.weights, self.names)
 
-    def __call__(
-        self, state: TensorDictBase, reference: TensorDictBase, layout: BodyLayout, step: Tensor
-    ) -> tuple[Tensor, dict[str, Tensor]]:
+    def __call__(self, body: BodyLike, reference: BodyLike, step: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
         s = self.scales
         terms = {
-            "pose": world_pose(state, reference, layout.parents, s["pose"], self.rotation_metric),
-            "velocity": joint_velocity(state, reference, s["velocity"]),
-            "end_effector": world_end_effector(state, reference, layout.end_effectors, s["end_effector"]),
-            "centre_of_mass": centre_of_mass(state, reference, s["centre_of_mass"]),
+            "pose": world_pose(body, reference, s["pose"], self.rotation_metric),
+            "velocity": joint_velocity(body, reference, s["velocity"]),
+            "end_effector": world_end_effector(body, reference, s["end_effector"]),
+            "centre_of_mass": centre_of_mass(body, reference, s["centre_of_mass"]),
         }
         return weighted_mean(terms, self.weights), terms
 

@@ -34,30 +34,44 @@ def conjugate(q: Tensor) -> Tensor:
     return q * _constant((1.0, -1.0, -1.0, -1.0), q.dtype, q.device)
 
 
+def matrix(q: Tensor) -> Tensor:
+    """Rotation matrices ``[..., 3, 3]`` of unit quaternions ``[..., 4]``: ``matrix(q) @ v`` is v turned by q."""
+    products = (q.unsqueeze(-1) * q.unsqueeze(-2)).flatten(-2)
+    return torch.matmul(products, _matrix_of_products(q.dtype, q.device)).unflatten(-1, (3, 3))
+
+
+@cache
+def _matrix_of_products(dtype: torch.dtype, device: torch.device) -> Tensor:
+    """``[16, 9]``: from the products ``q_i q_j`` to the entries of the rotation matrix, which are linear in them."""
+    out = torch.zeros(4, 4, 3, 3, dtype=dtype)
+    for i in range(3):
+        j, k = (i + 1) % 3, (i + 2) % 3
+        for part, sign in ((0, 1.0), (i + 1, 1.0), (j + 1, -1.0), (k + 1, -1.0)):
+            out[part, part, i, i] = sign
+        out[i + 1, j + 1, i, j] = out[i + 1, j + 1, j, i] = 2.0
+        out[0, k + 1, i, j], out[0, k + 1, j, i] = -2.0, 2.0
+    return out.reshape(16, 9).to(device)
+
+
 def rotate(q: Tensor, v: Tensor) -> Tensor:
     """Vectors ``[..., 3]`` turned by unit quaternions ``[..., 4]``; the batch axes broadcast."""
-    w, u = q[..., :1], q[..., 1:]
-    u, v = torch.broadcast_tensors(u, v)
-    t = 2.0 * torch.linalg.cross(u, v)
-    return v + w * t + torch.linalg.cross(u, t)
+    return torch.matmul(matrix(q), v.unsqueeze(-1)).squeeze(-1)
 
 
 def heading(q: Tensor) -> Tensor:
     """Heading ``[..., 4]``: keep (w, z), zero (x, y), renormalise. A half turn about a level axis has heading zero."""
-    kept = q * _constant((1.0, 0.0, 0.0, 1.0), q.dtype, q.device)
-    norm = kept.norm(dim=-1, keepdim=True)
-    identity = _constant((1.0, 0.0, 0.0, 0.0), q.dtype, q.device)
-    return torch.where(norm > 1e-12, kept / norm.clamp_min(1e-12), identity)
+    keep = _constant((1.0, 0.0, 0.0, 1.0), q.dtype, q.device)
+    # What is added is below rounding unless (w, z) vanishes; there it makes the identity of it.
+    kept = torch.addcmul(_constant((1e-16, 0.0, 0.0, 0.0), q.dtype, q.device), q, keep)
+    return kept / torch.linalg.vector_norm(kept, dim=-1, keepdim=True)
 
 
-def dehead(q: Tensor) -> Tensor:
-    """``inv(heading(q)) * q`` ``[..., 4]``: w is never negative and z is zero, whichever sign q comes with."""
-    return multiply(conjugate(heading(q)), q)
+def half_angle_between(p: Tensor, q: Tensor) -> Tensor:
+    """Half the angle ``[...]`` (rad, at most pi/2) of the rotation ``p * conj(q)``, the short way round.
 
-
-def half_angle(q: Tensor) -> Tensor:
-    """Half the rotation angle ``[...]`` (rad, at most pi/2) of unit quaternions, the short way round.
-
-    By atan2, which keeps its precision at small angles, where arccos(w) loses half the digits.
+    Of unit vectors in four dimensions: the angle between p and q or -q, whichever is nearer, as
+    ``2 atan2(|p - q|, |p + q|)`` (Kahan), which keeps its precision at small angles; arccos loses half the digits.
     """
-    return torch.atan2(q[..., 1:].norm(dim=-1), q[..., 0].abs())
+    apart = torch.linalg.vector_norm(p - q, dim=-1)
+    together = torch.linalg.vector_norm(p + q, dim=-1)
+    return 2.0 * torch.atan2(torch.minimum(apart, together), torch.maximum(apart, together))

@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-from tensordict import TensorDictBase
 from torch import Tensor
 
 
-def fallen(state: TensorDictBase, head_body: int, lowest_head_height: Tensor, margin: float) -> Tensor:
+def fallen(head_height: Tensor, lowest_head_height: Tensor, margin: float) -> Tensor:
     """``[N]``: the head is lower than the take's lowest reference head height minus ``margin`` (m).
 
     Args:
-        state: body state.
-        head_body: index of the head among the bodies.
+        head_height: ``[N]`` m.
         lowest_head_height: ``[N]`` m, of the take each world imitates.
         margin: 0.1 m in the authors' set-up.
     """
-    return state["xpos"][:, head_body, 2] < lowest_head_height - margin
+    return head_height < lowest_head_height - margin
