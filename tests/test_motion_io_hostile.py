@@ -92,7 +92,8 @@ BVH: dict[str, tuple[str | bytes, str]] = {
         + "MOTION\nFrames: 1\n",
         "more than 2048 joints",
     ),
-    "one huge line": ("HIERARCHY " + "{" * 30_000_000 + "\nMOTION\n", "line 1: 30000010 characters long"),
+    "one huge line": ("HIERARCHY " + "{" * 30_000_000 + "\nMOTION\n", "MOTION: stands behind 30000011 characters"),
+    "one long line": ("HIERARCHY " + "{" * 30_000 + "\nMOTION\n", "line 1: 30010 characters long"),
     "huge motion line": (GOOD + "0 " * 10_000_000, "line 30: 20000000 characters long"),
 }
 
@@ -320,7 +321,7 @@ NPZ: dict[str, tuple[Callable[[], bytes], str]] = {
     "frames": (lambda: archive(poses=POSES, trans=TRANS[:2], mocap_framerate=RATE), "trans: shape (2, 3)"),
     "rank": (lambda: archive(poses=POSES[0], trans=TRANS, mocap_framerate=RATE), "poses: must be [T, n]"),
     "no rows": (lambda: archive(poses=POSES[:0], trans=TRANS[:0], mocap_framerate=RATE), "poses: must be [T, n]"),
-    "text": (lambda: archive(poses=np.array([["a"]]), trans=TRANS), "poses: must be [T, n] floats"),
+    "text": (lambda: archive(poses=np.array([["a"]]), trans=TRANS), "poses: holds '<U1', which are no numbers"),
     "nan": (lambda: archive(poses=POSES * np.nan, trans=TRANS, mocap_framerate=RATE), "poses: frame 0 is not finite"),
     "pickle": (lambda: archive(poses=np.array([{}], dtype=object), trans=TRANS), "poses: holds pickled objects"),
     "false shape": (lambda: archive(poses=npy_header((10**12, 156)) + bytes(99)), "poses: shape (1000000000000, 156)"),
@@ -334,7 +335,7 @@ NPZ: dict[str, tuple[Callable[[], bytes], str]] = {
 
 @pytest.mark.parametrize("case", sorted(NPZ))
 def test_npz(case: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    assert _npz.MAX_UNPACKED_BYTES == 2**30
+    assert _npz.MAX_UNPACKED_BYTES == 2**28
     monkeypatch.setattr(_npz, "MAX_UNPACKED_BYTES", 2**24)
     make, expected = NPZ[case]
     path = tmp_path / "clip.npz"
@@ -346,12 +347,12 @@ def test_npz(case: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None
     ("change", "expected"),
     [
         ({"version": 99}, "header.version: 99; this program reads 1"),
-        ({"fps": -1}, "fps must be positive"),
-        ({"fps": "fast"}, "could not convert"),
+        ({"fps": -1}, "header.fps: -1 is not"),
+        ({"fps": "fast"}, "header.fps: 'fast' is not"),
         ({"meta": 3}, "header.meta"),
         ({"skeleton": {"name": "", "joints": []}}, "header.skeleton: a skeleton needs at least one joint"),
         ({"skeleton": {}}, "header.skeleton: key 'joints' is missing"),
-        ({"skeleton": {"joints": [{"name": "a", "parent": 4}]}}, "header.skeleton: key 'offset' is missing"),
+        ({"skeleton": {"joints": [{"name": "a", "parent": 4}]}}, "header.skeleton: key 'dofs' is missing"),
         ({"contact_names": None}, "qpos: "),
     ],
 )  # fmt: skip

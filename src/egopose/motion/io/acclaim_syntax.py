@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from egopose.errors import InputError
-from egopose.motion.io._files import MAX_JOINTS, excerpt, read_text
+from egopose.motion.io._files import MAX_JOINTS, check_values, excerpt, read_text
 from egopose.motion.rotations import Array
 
 _MAX_VALUE = 1e7
@@ -206,6 +206,7 @@ def parse_amc(path: Path, asf: AsfFile) -> tuple[Array, dict[str, int], bool]:
             finish()
             if len(words[0]) > 9 or int(words[0]) != len(rows) + 1:
                 raise InputError(path, f"line {number}", f"frame {excerpt(words[0])} where {len(rows) + 1} should be")
+            check_values(path, f"line {number}", len(rows) + 1, width + 12)
             row, seen = np.zeros(width), set()
             rows.append(row)
         elif words[0] in counts:

@@ -110,7 +110,8 @@ def _rate(path: Path, arrays: dict[str, np.ndarray]) -> float:
         if name in arrays:
             value = arrays[name]
             if value.size != 1 or value.dtype.kind not in "fiu" or not 0.1 <= float(value.reshape(())) <= 1e5:
-                raise InputError(path, name, f"{excerpt(str(value.tolist()))} is not a frame rate")
+                shown = str(value.tolist()) if value.size == 1 else f"an array of shape {value.shape}"
+                raise InputError(path, name, f"{excerpt(shown)} is not a frame rate")
             return float(value.reshape(()))
     raise InputError(path, _RATES[0], "missing: the frame rate is not said")
 

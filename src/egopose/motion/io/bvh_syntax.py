@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from egopose.errors import InputError
-from egopose.motion.io._files import MAX_JOINTS, excerpt, read_text
+from egopose.motion.io._files import MAX_JOINTS, check_values, excerpt, read_text
 from egopose.motion.rotations import Array
 
 _MOTION = re.compile(r"^[ \t]*MOTION[ \t]*$", re.MULTILINE)
@@ -23,6 +23,13 @@ _CHANNELS = {f"{axis}{kind}" for axis in "xyz" for kind in ("position", "rotatio
 
 #: Coordinates beyond this (in any unit) are no person's.
 _MAX_VALUE = 1e7
+
+#: Characters of a hierarchy: 2048 joints take about 400 kB. Its words are taken one by one.
+_MAX_HIERARCHY = 4 * 2**20
+_MAX_HIERARCHY_LINE = 16 * 1024
+
+#: End Sites in sum.
+_MAX_TIPS = 4 * MAX_JOINTS
 
 #: Characters a written number may take: the longest double is 24.
 _MAX_NUMBER_CHARACTERS = 64
@@ -60,7 +67,7 @@ def parse_bvh(path: Path) -> BvhFile:
     if motion is None:
         raise InputError(path, f"line {text.count(chr(10)) + 1}", "no MOTION section: not a BVH file, or cut short")
     joints = _parse_hierarchy(path, text, motion.start())
-    frame_time, values = _parse_motion(path, text, motion.end(), sum(len(j.channels or ()) for j in joints))
+    frame_time, values = _parse_motion(path, text, motion.end(), joints)
     return BvhFile(joints, frame_time, values)
 
 
@@ -70,13 +77,15 @@ def _parse_hierarchy(path: Path, text: str, end: int) -> list[BvhJoint]:
     stack: list[int] = []  # open braces: joint indices, -1 for an End Site
     pending: int | None = None  # a joint or End Site announced, its brace not yet seen
     started = closed = False
-    start, number = 0, 0
+    start, number, tips = 0, 0, 0
+    if end > _MAX_HIERARCHY:
+        raise InputError(path, "MOTION", f"stands behind {end} characters: more than any hierarchy takes")
     while start < end:
         stop = text.find("\n", start, end)
         stop = end if stop < 0 else stop
         number += 1
         where = f"line {number}"
-        if stop - start > 64 * 1024:
+        if stop - start > _MAX_HIERARCHY_LINE:
             raise InputError(path, where, f"{stop - start} characters long: not a line of a BVH hierarchy")
         tokens = text[start:stop].replace("{", " { ").replace("}", " } ").split()
         start = stop + 1
@@ -131,6 +140,9 @@ def _parse_hierarchy(path: Path, text: str, end: int) -> list[BvhJoint]:
                     joints[stack[-1]].offset = offset
                 else:
                     joints[stack[-2]].tips.append(offset)
+                    tips += 1
+                    if tips > _MAX_TIPS:
+                        raise InputError(path, where, f"more than {_MAX_TIPS} End Sites")
             elif key == "CHANNELS":
                 if not stack or stack[-1] < 0:
                     raise InputError(path, where, "CHANNELS outside a joint")
@@ -174,7 +186,8 @@ def _numbers(path: Path, where: str, label: str, tokens: list[str], count: int) 
     return values[0], values[1], values[2]
 
 
-def _parse_motion(path: Path, text: str, start: int, n_channels: int) -> tuple[float, Array]:
+def _parse_motion(path: Path, text: str, start: int, joints: list[BvhJoint]) -> tuple[float, Array]:
+    n_channels = sum(len(j.channels or ()) for j in joints)
     number = text.count("\n", 0, start) + 1
     fields: dict[str, tuple[str, int]] = {}
     position = start + 1
@@ -203,6 +216,8 @@ def _parse_motion(path: Path, text: str, start: int, n_channels: int) -> tuple[f
     if frames * n_channels * 2 > room + 2:  # a number and the blank after it take two bytes at least
         cause = f"{frames} frames of {n_channels} numbers announced, only {max(room, 0)} bytes follow: cut short"
         raise InputError(path, f"line {where}", cause)
+    # Every joint becomes a translation in time, channels or not, and the root a pose.
+    check_values(path, f"line {where}", frames, n_channels + 3 * len(joints) + 12)
     value, where = fields["frame time"]
     try:
         frame_time = float(value)

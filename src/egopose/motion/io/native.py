@@ -14,6 +14,15 @@ from egopose.motion.io._npz import read_arrays
 from egopose.motion.motion import Motion
 from egopose.motion.skeleton import Dof, Joint, Skeleton
 
+#: Bytes of the header: 2048 joints take 400 kB, ``meta`` a few. As Python objects it takes up to forty times as much.
+_MAX_HEADER = 8 * 2**20
+
+#: No coordinate (m, rad) and no torque (N m) of a person is larger.
+_MAX_VALUE = 1e7
+
+#: Three slides and three hinges, as the project's own readers make them at most; tips beyond any mesh's.
+_MAX_DOFS, _MAX_TIPS = 6, 256
+
 FORMAT, VERSION = "egopose.motion", 1
 
 
@@ -60,6 +69,8 @@ def read_native(path: str | Path) -> Motion:
     arrays = read_arrays(path, ("header", "qpos", "contacts", "torques"))
     if "header" not in arrays or arrays["header"].dtype != np.uint8 or arrays["header"].ndim != 1:
         raise InputError(path, "header", "missing or not bytes: not a clip of this project")
+    if len(arrays["header"]) > _MAX_HEADER:
+        raise InputError(path, "header", f"{len(arrays['header'])} bytes; at most {_MAX_HEADER} are read")
     try:
         header = json.loads(arrays["header"].tobytes().decode("utf-8"))
     except (ValueError, RecursionError) as error:
@@ -79,6 +90,15 @@ def read_native(path: str | Path) -> Motion:
         raise InputError(
             path, "torques", f"{arrays['torques'].shape[1]} columns for {skeleton.n_dofs} degrees of freedom"
         )
+    for label in {"qpos", "torques"} & set(arrays):
+        bad = ~(np.abs(arrays[label]) < _MAX_VALUE).reshape(len(arrays[label]), -1).all(axis=1)
+        if bad.any():
+            raise InputError(path, label, f"frame {int(np.argmax(bad))} is not finite or absurdly large")
+    if qpos.ndim == 2 and qpos.shape[1] >= 7 and (np.linalg.norm(qpos[:, 3:7], axis=1) < 0.1).any():
+        raise InputError(path, "qpos", "the root's quaternion is shorter than 0.1")
+    fps = header.get("fps")
+    if not isinstance(fps, int | float) or isinstance(fps, bool) or not 1e-3 <= fps <= 1e5:
+        raise InputError(path, "header.fps", f"{fps!r:.40} is not a frame rate")
     meta = header.get("meta", {})
     if not isinstance(meta, dict):
         raise InputError(path, "header.meta", "is not an object")
@@ -89,7 +109,7 @@ def read_native(path: str | Path) -> Motion:
         lambda: Motion(
             skeleton,
             qpos,
-            float(header["fps"]),
+            float(fps),
             name=str(header["name"]),
             contacts=arrays.get("contacts"),
             contact_names=tuple(str(n) for n in header["contact_names"]),
@@ -118,6 +138,9 @@ def skeleton_from_json(value: Any) -> Skeleton:
     """Raises KeyError, TypeError or ValueError on what is no skeleton."""
     if len(value["joints"]) > MAX_JOINTS:
         raise ValueError(f"{len(value['joints'])} joints; at most {MAX_JOINTS}")
+    for joint in value["joints"]:
+        if len(joint["dofs"]) > _MAX_DOFS or len(joint["tips"]) > _MAX_TIPS:
+            raise ValueError(f"joint {joint['name']!r:.40} has more than {_MAX_DOFS} dofs or {_MAX_TIPS} tips")
     joints = tuple(
         Joint(
             str(j["name"]),
@@ -153,4 +176,4 @@ def _checked(path: Path, field: str, make: Any) -> Any:
     except KeyError as error:
         raise InputError(path, field, f"key {error} is missing") from error
     except (TypeError, ValueError, OverflowError) as error:
-        raise InputError(path, field, str(error)) from error
+        raise InputError(path, field, " ".join(str(error).split())[:200]) from error
