@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import re
+import sys
 import types
 import typing
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import MISSING, fields
 from datetime import datetime
+from functools import wraps
 from pathlib import Path
 from typing import Any, TypeVar, Union
 
+import hydra
 from hydra import compose, initialize_config_dir
+from hydra._internal.utils import get_args_parser
 from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
@@ -116,6 +121,47 @@ def compose_config(name: str, overrides: Sequence[str] = ()) -> dict[str, Any]:
             return resolved(compose(name, list(overrides)))
     except HydraException as error:
         raise InputError(f"conf/{name}.yaml", "override", str(error).splitlines()[0]) from None
+
+
+def check_arguments(arguments: Sequence[str]) -> None:
+    """To be called before Hydra's main sees a command line that may bring a stranger's configuration with it.
+
+    Raises:
+        InputError: ``--config-dir``, ``--config-path`` or a ``file://`` search path holds configuration that names
+            something to call; a rerun from a pickle.
+    """
+    from egopose.untrusted import check_config_folder
+
+    given, rest = get_args_parser().parse_known_args(list(arguments))
+    if given.experimental_rerun is not None:
+        raise InputError(given.experimental_rerun, "--experimental-rerun", "is a pickle, and no pickle is ever read")
+    words = [*given.overrides, *rest]
+    folders = [given.config_dir, given.config_path, *re.findall(r"file://([^,\]'\"]+)", " ".join(words))]
+    if given.config_name:
+        folders.append(str((config_dir() / given.config_name).parent))
+    for folder in folders:
+        if folder and Path(folder).is_dir() and Path(folder).resolve() != config_dir().resolve():
+            check_config_folder(Path(folder))
+
+
+def command(name: str) -> Callable[[Callable[[DictConfig], None]], Callable[[], None]]:
+    """``hydra.main`` on ``conf/NAME.yaml`` behind :func:`check_arguments`; an InputError ends with its one line."""
+
+    def decorate(function: Callable[[DictConfig], None]) -> Callable[[], None]:
+        entry = hydra.main(version_base="1.3", config_path=str(config_dir()), config_name=name)(function)
+
+        @wraps(function)
+        def main() -> None:
+            try:
+                check_arguments(sys.argv[1:])
+            except InputError as error:
+                print(f"error: {error}", file=sys.stderr)
+                raise SystemExit(2) from None
+            entry()
+
+        return main
+
+    return decorate
 
 
 def register_resolvers() -> None:

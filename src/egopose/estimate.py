@@ -11,10 +11,9 @@ from collections.abc import Mapping  # noqa: E402
 from pathlib import Path  # noqa: E402
 from typing import TYPE_CHECKING, Any  # noqa: E402
 
-import hydra  # noqa: E402
 from omegaconf import DictConfig  # noqa: E402
 
-from egopose.config import config_dir, from_mapping, resolved  # noqa: E402
+from egopose.config import command, from_mapping, resolved  # noqa: E402
 from egopose.errors import InputError  # noqa: E402
 
 if TYPE_CHECKING:
@@ -161,7 +160,7 @@ def estimate_video(values: Mapping[str, Any]) -> Path:
     return run_estimate(values, load_agent(checkpoint, material), pose_motion, video, out)
 
 
-@hydra.main(version_base="1.3", config_path=str(config_dir()), config_name="estimate")
+@command("estimate")
 def main(config: DictConfig) -> None:
     """Hydra's entry."""
     try:

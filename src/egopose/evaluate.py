@@ -12,10 +12,9 @@ from dataclasses import dataclass  # noqa: E402
 from pathlib import Path  # noqa: E402
 from typing import TYPE_CHECKING, Any  # noqa: E402
 
-import hydra  # noqa: E402
 from omegaconf import DictConfig  # noqa: E402
 
-from egopose.config import config_dir, from_mapping, resolved  # noqa: E402
+from egopose.config import command, from_mapping, resolved  # noqa: E402
 from egopose.errors import InputError  # noqa: E402
 
 if TYPE_CHECKING:
@@ -144,7 +143,7 @@ def output_folder(out: str | None, checkpoint: Path, split: str) -> Path:
     return folder
 
 
-@hydra.main(version_base="1.3", config_path=str(config_dir()), config_name="evaluate")
+@command("evaluate")
 def main(config: DictConfig) -> None:
     """Hydra's entry."""
     from egopose.pipeline import load_agent, take_videos

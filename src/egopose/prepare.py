@@ -8,16 +8,15 @@ prepare_runtime()
 
 import sys  # noqa: E402
 
-import hydra  # noqa: E402
 from omegaconf import DictConfig  # noqa: E402
 
-from egopose.config import config_dir, register_resolvers, resolved  # noqa: E402
+from egopose.config import command, register_resolvers, resolved  # noqa: E402
 from egopose.errors import InputError  # noqa: E402
 
 register_resolvers()
 
 
-@hydra.main(version_base="1.3", config_path=str(config_dir()), config_name="prepare")
+@command("prepare")
 def main(config: DictConfig) -> None:
     """Hydra's entry."""
     from egopose.data.preparation import prepare

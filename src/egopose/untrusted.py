@@ -15,14 +15,15 @@ from typing import Any
 
 import torch
 import yaml
+from omegaconf import OmegaConf
 from tensordict import TensorDict
 
 from egopose.errors import InputError
 
 #: The largest JSON or YAML read, bytes: as Python objects it takes up to some forty times as much.
 MAX_JSON_BYTES = 16 * 2**20
-MAX_YAML_BYTES = 2**20
-_MAX_YAML_VALUES = 100_000
+MAX_YAML_BYTES = 2**18
+_MAX_YAML_VALUES = 50_000
 
 #: The most a checkpoint's files may hold in sum: loading one copies it. Policies and regressors here take 1 to 100 MB.
 MAX_CHECKPOINT_BYTES = 512 * 2**20
@@ -65,7 +66,7 @@ def read_json(path: Path, field: str, limit: int = MAX_JSON_BYTES) -> Any:
 
 
 def read_yaml(path: Path, field: str) -> Any:
-    """Plain values of a YAML file; interpolations stay the text they are.
+    """Plain values of a YAML file, as Hydra reads them; interpolations stay the text they are.
 
     Raises:
         InputError: missing, over :data:`MAX_YAML_BYTES`, not YAML, a tag that would build an object, an alias (a few
@@ -80,15 +81,48 @@ def read_yaml(path: Path, field: str) -> Any:
         for count, event in enumerate(yaml.parse(text, Loader=yaml.SafeLoader)):
             if isinstance(event, yaml.AliasEvent):
                 raise InputError(path, field, f"line {event.start_mark.line + 1}: aliases are not read")
-            if count > 2 * _MAX_YAML_VALUES:
+            if count > _MAX_YAML_VALUES:
                 raise InputError(path, field, f"is damaged: more than {_MAX_YAML_VALUES} values")
-        return yaml.safe_load(text)
+        return OmegaConf.to_container(OmegaConf.create(text), resolve=False)
+    except InputError:
+        raise
     except RecursionError:
         raise InputError(path, field, "is damaged: nested too deeply") from None
-    except (yaml.YAMLError, OSError, ValueError, TypeError, OverflowError, AttributeError) as error:
-        if isinstance(error, InputError):
-            raise
+    except Exception as error:  # yaml and OmegaConf raise whatever the damage happens to be
         raise InputError(path, field, f"is damaged: {' '.join(str(error).split())}"[:200]) from None
+
+
+#: What in a configuration makes Hydra and ``logging.config`` import and call things by name.
+_CALLS = ("_target_", "()", "class", "ext://", "pkg://", "!!python")
+
+
+def check_config_folder(folder: Path) -> None:
+    """A folder of configuration that does not belong to the project may set values and name nothing to be called.
+
+    Hydra calls what ``hydra.callbacks``, launchers, sweepers and the logging set-up name, before this project's own
+    code sees the configuration.
+
+    Raises:
+        InputError: a YAML file in it names something to call, or cannot be read (:func:`read_yaml`).
+    """
+    for count, path in enumerate(sorted([*folder.rglob("*.yaml"), *folder.rglob("*.yml")])):
+        if count > _MAX_FILES:
+            raise InputError(folder, "files", f"more than {_MAX_FILES}: this is no folder of configuration")
+        waiting = [read_yaml(path, "configuration")]
+        while waiting:
+            value = waiting.pop()
+            if isinstance(value, dict):
+                waiting += [*value, *value.values()]
+            elif isinstance(value, list):
+                waiting += value
+            elif isinstance(value, str) and (call := next((c for c in _CALLS if _names(value, c)), None)):
+                cause = f"{call!r} names something to call; only the project's own configuration may"
+                raise InputError(path, value[:60], cause)
+
+
+def _names(value: str, call: str) -> bool:
+    """Whether a word of a configuration holds ``call``; a key for its last part, ``hydra.x._target_``."""
+    return call in value if call.endswith("//") or call.startswith("!!") else value.split(".")[-1] == call
 
 
 def load_tensors(folder: Path, field: str) -> TensorDict:

@@ -6,11 +6,14 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib.resources import files
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
 from egopose.config import convert
 from egopose.errors import InputError
+
+_MAX_FILES = 100_000
 
 
 @dataclass(frozen=True)
@@ -47,7 +50,7 @@ def find_sources(settings: Mapping[str, Any]) -> list[TakeSource]:
     Raises:
         InputError: a file is missing or nothing is found; names the field.
     """
-    kind = settings["source"]
+    kind = settings.get("source")
     if kind == "embedded":
         found = _in_folder(Path(str(files("egopose") / "assets" / "clips")), settings)
     elif kind == "folder":
@@ -57,7 +60,7 @@ def find_sources(settings: Mapping[str, Any]) -> list[TakeSource]:
             )
         found = _in_folder(Path(str(settings["folder"])).expanduser(), settings)
     elif kind == "takes":
-        found = _listed(settings["takes"], dict(settings.get("reader") or {}))
+        found = _listed(settings.get("takes"), _options(settings.get("reader"), "data.reader"))
     else:
         raise InputError("data", "source", f"must be embedded, folder or takes, not {kind!r}")
     names = [s.name for s in found]
@@ -69,37 +72,63 @@ def find_sources(settings: Mapping[str, Any]) -> list[TakeSource]:
 def _in_folder(folder: Path, settings: Mapping[str, Any]) -> list[TakeSource]:
     if not folder.is_dir():
         raise InputError(folder, "data.folder", "is not a folder")
-    excluded = set(settings.get("exclude") or ())
+    excluded = {str(name) for name in convert(settings.get("exclude") or [], tuple[Any, ...], "data", "data.exclude")}
+    subject, reader = _expression(settings.get("subject")), _options(settings.get("reader"), "data.reader")
+    pattern = convert(settings.get("pattern"), str, "data", "data.pattern")
     try:
-        subject = re.compile(settings["subject"])
-    except re.error as error:
-        raise InputError("data", "data.subject", f"{settings['subject']!r} is no regular expression: {error}") from None
-    if not subject.groups:
-        raise InputError("data", "data.subject", f"{settings['subject']!r} has no group (...) for the subject's name")
+        paths = sorted(islice(folder.glob(pattern), _MAX_FILES))
+    except (ValueError, NotImplementedError, IndexError, OSError) as error:
+        raise InputError("data", "data.pattern", f"{pattern!r:.60} cannot be looked for: {error}"[:200]) from None
     out = []
-    for path in sorted(folder.glob(settings["pattern"])):
+    for path in paths:
         name = path.name.split(".")[0]
         if name in excluded:
             continue
         match = subject.match(name)
         if match is None:
             raise InputError(path, "data.subject", f"{settings['subject']!r} does not match {name!r}")
-        out.append(TakeSource(name, match[1], path, dict(settings.get("reader") or {})))
+        out.append(TakeSource(name, match[1], path, dict(reader)))
     if not out:
-        raise InputError(folder, "data.pattern", f"{settings['pattern']!r} matches no file")
+        raise InputError(folder, "data.pattern", f"{pattern!r:.60} matches no file")
     return out
 
 
-def _listed(rows: Sequence[Mapping[str, Any]], reader: dict[str, Any]) -> list[TakeSource]:
+def _expression(text: Any) -> re.Pattern[str]:
+    """``data.subject``, which must not be one that takes for ever on a long name."""
+    text = convert(text, str, "data", "data.subject")
+    # A repeated group, or many repetitions in a row, is tried in exponentially many ways.
+    if len(text) > 200 or re.search(r"\)[*+?{]", text) or len(re.findall(r"(?<!\()(?<![*+?}])[*+?{]", text)) > 3:
+        cause = f"{text!r:.60}: at most 200 characters, three repetitions and no repeated group are tried"
+        raise InputError("data", "data.subject", cause)
+    try:
+        expression = re.compile(text)
+    except (re.error, OverflowError, RecursionError) as error:
+        raise InputError("data", "data.subject", f"{text!r:.60} is no regular expression: {error}") from None
+    if not expression.groups:
+        raise InputError("data", "data.subject", f"{text!r:.60} has no group (...) for the subject's name")
+    return expression
+
+
+def _options(value: Any, field: str) -> dict[str, Any]:
+    if value is not None and not isinstance(value, Mapping):
+        raise InputError("data", field, f"must be a mapping, not {value!r:.60}")
+    return {str(key): option for key, option in (value or {}).items()}
+
+
+def _listed(rows: Any, reader: dict[str, Any]) -> list[TakeSource]:
+    if not isinstance(rows, Sequence) or isinstance(rows, str):
+        raise InputError("data", "data.takes", f"must be a list of {{motion: FILE, ...}}, not {rows!r:.60}")
     out = []
     for number, row in enumerate(rows):
         label = f"data.takes[{number}]"
         if not isinstance(row, Mapping):
-            raise InputError("data", label, f"must be {{motion: FILE, ...}}, not {row!r}")
+            raise InputError("data", label, f"must be {{motion: FILE, ...}}, not {row!r:.60}")
         if unknown := set(row) - {"motion", "video", "sync_offset", "subject", "name", "reader", "mapping"}:
-            raise InputError("data", label, f"has no setting {sorted(unknown)[0]!r}")
+            raise InputError("data", label, f"has no setting {sorted(map(str, unknown))[0]!r:.60}")
         for key in ("motion", "video"):
-            if row.get(key) and not Path(row[key]).expanduser().is_file():
+            if row.get(key) is not None and (not isinstance(row[key], str) or "\0" in row[key]):
+                raise InputError("data", f"{label}.{key}", f"must be a path, not {row[key]!r:.60}")
+            if row.get(key) and not _is_file(row[key]):
                 raise InputError(row[key], f"{label}.{key}", "there is no such file")
         if not row.get("motion"):
             raise InputError("data", f"{label}.motion", "is missing")
@@ -112,12 +141,19 @@ def _listed(rows: Sequence[Mapping[str, Any]], reader: dict[str, Any]) -> list[T
                 name,
                 str(row.get("subject", "1")),
                 motion,
-                {**reader, **(row.get("reader") or {})},
+                {**reader, **_options(row.get("reader"), f"{label}.reader")},
                 Path(row["video"]).expanduser().resolve() if row.get("video") else None,
                 convert(row.get("sync_offset", 0.0), float, "data", f"{label}.sync_offset"),
-                dict(row["mapping"]) if row.get("mapping") else None,
+                _options(row["mapping"], f"{label}.mapping") if row.get("mapping") else None,
             )
         )
     if not out:
         raise InputError("data", "takes", "the list is empty")
     return out
+
+
+def _is_file(text: str) -> bool:
+    try:
+        return Path(text).expanduser().is_file()
+    except (OSError, RuntimeError, ValueError):  # a name too long, a home that is not there, a lone surrogate
+        return False
