@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
@@ -25,6 +26,7 @@ import torch
 from tensordict import MemoryMappedTensor, TensorDict
 from torch import Tensor
 
+from egopose.config import convert, from_mapping
 from egopose.errors import InputError
 from egopose.motion.io import read_motion, write_motion
 from egopose.motion.motion import Motion
@@ -88,20 +90,20 @@ class TakeStore:
             raise InputError(
                 root, "store.json", "is missing: this is not a take store; make one: python -m egopose.prepare"
             )
-        try:
-            self.card: dict[str, Any] = read_json(path, "takes")
-            schema = self.card["schema"]
-            if schema != SCHEMA:
-                raise InputError(path, "schema", f"is {schema}, this version reads {SCHEMA}; prepare the data again")
-            self.takes = tuple(
-                TakeInfo(**{**t, "supported": tuple((int(a), int(b)) for a, b in t["supported"])})
-                for t in self.card["takes"]
+        card = read_json(path, "takes")
+        if not isinstance(card, dict):
+            raise InputError(path, "takes", f"is damaged: cannot be read: {card!r:.60}")
+        for key, kind in (("schema", int), ("fps", float), ("fingerprint", str), ("takes", list)):
+            if key not in card:
+                raise InputError(path, key, "is damaged: it is missing")
+            convert(card[key], kind, str(path), key)
+        if card["schema"] != SCHEMA:
+            raise InputError(
+                path, "schema", f"is {card['schema']}, this version reads {SCHEMA}; prepare the data again"
             )
-            self.fps = float(self.card["fps"])
-        except (KeyError, TypeError, ValueError) as error:
-            if isinstance(error, InputError):
-                raise
-            raise InputError(path, "takes", f"cannot be read: {error}") from None
+        self.card: dict[str, Any] = card
+        self.fps = float(card["fps"])
+        self.takes = tuple(_take_info(path, row, number) for number, row in enumerate(card["takes"]))
         self.frames_total = sum(t.length for t in self.takes)
 
     @classmethod
@@ -244,6 +246,24 @@ class TakeStore:
         if not folder.is_dir():
             raise InputError(self.root, field, "is missing: python -m egopose.prepare makes it")
         return load_tensors(folder, field)
+
+
+def _take_info(path: Path, row: Any, number: int) -> TakeInfo:
+    """A row of ``store.json``; what is written by its names stays inside the store."""
+    where = f"takes[{number}]"
+    if not isinstance(row, dict):
+        raise InputError(path, where, f"cannot be read: {row!r:.60}")
+    try:
+        take = from_mapping(TakeInfo, row, "takes")
+    except InputError as error:
+        raise InputError(path, f"{where}.{error.field}", error.cause) from None
+    if not (0 <= take.offset < 2**40 and 0 <= take.length < 2**40):
+        raise InputError(path, where, f"cannot be read: {take.length} frames from {take.offset} on")
+    parts = Path(take.video).parts
+    inside = not Path(take.video).is_absolute() and ".." not in parts
+    if take.name in ("", ".", "..") or re.search(r"[/\\\0]", take.name) or (take.rendered and not inside):
+        raise InputError(path, where, f"{take.name!r:.60}, {take.video!r:.60}: lies outside the store")
+    return take
 
 
 def runs_of(mask: np.ndarray) -> tuple[tuple[int, int], ...]:
