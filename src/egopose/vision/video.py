@@ -19,7 +19,18 @@ Frame = NDArray[np.uint8]
 
 # Beyond any camera sold (8K is 7680 x 4320): a header that says more is broken or hostile.
 MAX_SIDE = 8192
+MAX_PIXELS = 7680 * 4320
 MAX_FPS = 1000.0
+
+# A pause longer than this (s) is no camera's: filling it with the frame before it could go on for ever.
+MAX_GAP = 5.0
+
+# Decoders keep up to 16 reference frames, and one more for each thread.
+_DECODER_THREADS = 2
+
+# The kinds of box a movie file begins with. FFmpeg would open anything it knows by its content: play lists, which name
+# other files and addresses to be read, among them.
+_FIRST_BOXES = (b"ftyp", b"moov", b"mdat", b"free", b"skip", b"wide", b"pnot")
 
 
 @dataclass(frozen=True)
@@ -109,7 +120,10 @@ def _capture(path: str | PathLike[str]) -> Iterator[tuple[cv2.VideoCapture, Vide
         raise InputError(path, "video", "no such file")
     if Path(path).stat().st_size == 0:
         raise InputError(path, "video", "the file is empty")
-    capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
+    with Path(path).open("rb") as stream:
+        if stream.read(8)[4:] not in _FIRST_BOXES:
+            raise InputError(path, "video", "not an MP4: it does not begin with a box of one")
+    capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG, [cv2.CAP_PROP_N_THREADS, _DECODER_THREADS])
     try:
         if not capture.isOpened():
             raise InputError(path, "video", "not a video that FFmpeg can open: damaged, or of an unknown format")
@@ -117,10 +131,11 @@ def _capture(path: str | PathLike[str]) -> Iterator[tuple[cv2.VideoCapture, Vide
             int(capture.get(cv2.CAP_PROP_FRAME_WIDTH)),
             int(capture.get(cv2.CAP_PROP_FRAME_HEIGHT)),
             float(capture.get(cv2.CAP_PROP_FPS)),
-            int(max(capture.get(cv2.CAP_PROP_FRAME_COUNT), 0)),
+            int(min(max(capture.get(cv2.CAP_PROP_FRAME_COUNT), 0), 2**62)),
         )
-        if not (0 < info.width <= MAX_SIDE and 0 < info.height <= MAX_SIDE):
-            raise InputError(path, "size", f"{info.width} x {info.height}; up to {MAX_SIDE} x {MAX_SIDE} can be read")
+        if not (0 < info.width <= MAX_SIDE and 0 < info.height <= MAX_SIDE and info.width * info.height <= MAX_PIXELS):
+            cause = f"{info.width} x {info.height}; up to {MAX_SIDE} a side and {MAX_PIXELS} pixels can be read"
+            raise InputError(path, "size", cause)
         if not 0 < info.fps <= MAX_FPS:
             raise InputError(path, "fps", f"{info.fps}; expected more than 0 and at most {MAX_FPS:g}")
         yield capture, info
@@ -141,12 +156,16 @@ def read_frames(path: str | PathLike[str]) -> Iterator[tuple[float, Frame]]:
     not advance (some recorders leave them out) the header's rate takes its place.
 
     Raises:
-        InputError: missing, empty or damaged file, no frame in it, a size or rate that cannot be.
+        InputError: missing, empty or damaged file, no frame in it, a size or rate that cannot be, frames of different
+            sizes, a pause of over :data:`MAX_GAP`.
     """
     with _capture(path) as (capture, info):
         first = last = None
         while True:
-            ok, bgr = capture.read()
+            try:
+                ok, bgr = capture.read()
+            except cv2.error as error:
+                raise InputError(path, "video", f"cannot be decoded: {' '.join(str(error).split())}"[:200]) from None
             if not ok:
                 break
             stamp = capture.get(cv2.CAP_PROP_POS_MSEC) / 1000.0
@@ -154,7 +173,14 @@ def read_frames(path: str | PathLike[str]) -> Iterator[tuple[float, Frame]]:
                 first, time = stamp, 0.0
             else:
                 time = stamp - first if stamp - first > last else last + 1.0 / info.fps
+                if time - last > MAX_GAP:
+                    cause = (
+                        f"no frame from {last:.3f} to {time:.3f} s: a pause of over {MAX_GAP:g} s, or damaged stamps"
+                    )
+                    raise InputError(path, "time stamps", cause)
             last = time
+            if bgr.shape != (info.height, info.width, 3):
+                raise InputError(path, "size", f"a frame of {bgr.shape[1]} x {bgr.shape[0]} among others: damaged")
             yield time, cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB).astype(np.uint8, copy=False)
         if first is None:
             raise InputError(path, "video", "no frame can be decoded: the file is damaged")
