@@ -7,6 +7,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 import yaml
@@ -19,7 +20,7 @@ from egopose.config import from_mapping
 from egopose.errors import InputError
 from egopose.models.mirror import StateMirror
 from egopose.models.regressor import StateRegressor
-from egopose.training.fragments import Span, split_validation, training_windows
+from egopose.training.fragments import Span, cross_fit_blocks, split_validation, training_windows, without_block
 from egopose.training.predictions import predict_span, predict_takes, regression_error
 from egopose.training.regressor_settings import RegressorSettings, learning_rate_at
 from egopose.training.supervised import Progress, State, build_regressor, train_regressor
@@ -264,3 +265,22 @@ def test_one_cycle_rises_and_ends_at_nothing() -> None:
     assert max(rates) == pytest.approx(QUICK.learning_rate)
     assert rates[0] < 0.1 * QUICK.learning_rate
     assert rates[-1] == pytest.approx(0.0, abs=1e-12)
+
+
+@hypothesis_settings(max_examples=50, deadline=None)
+@given(
+    lengths=st.lists(st.integers(1, 400), min_size=1, max_size=5), folds=st.integers(2, 6), margin=st.integers(0, 12)
+)
+def test_cross_fitting_covers_every_frame_once_and_never_learns_what_it_predicts(
+    lengths: list[int], folds: int, margin: int
+) -> None:
+    ends = np.cumsum([0, *(n + 3 for n in lengths)])
+    fragments = [Span(int(a), int(a) + n) for a, n in zip(ends[:-1], lengths, strict=True)]
+    blocks = cross_fit_blocks(fragments, folds)
+    frames = [t for block in blocks for span in block for t in range(span.start, span.stop)]
+    assert sorted(frames) == [t for f in fragments for t in range(f.start, f.stop)]
+    for block in blocks:
+        learned = {t for s in without_block(fragments, block, margin, 10) for t in range(s.start, s.stop)}
+        assert learned <= set(frames)
+        for span in block:
+            assert not learned & set(range(span.start, span.stop))

@@ -32,10 +32,10 @@ from egopose.humanoid.model import HumanoidModel
 from egopose.models.mirror import state_mirror
 from egopose.models.regressor import StateRegressor
 from egopose.training.checkpoint import CHECKSUMS, ComponentState, RunCheckpoint, metadata_of, read_json, verify
-from egopose.training.fragments import Span
+from egopose.training.fragments import Span, cross_fit_blocks, without_block
 from egopose.training.predictions import predict_takes
 from egopose.training.regressor_settings import RegressorSettings
-from egopose.training.supervised import Progress, State, build_regressor, train_regressor
+from egopose.training.supervised import Progress, State, TrainingResult, build_regressor, train_regressor
 from egopose.vision.encoders import build_encoder
 
 TABLE_KEYS = ("humanoid_state", "visual_context", "visual_features", "joint_targets")
@@ -123,6 +123,16 @@ def _predict(
 ) -> dict[str, Tensor]:
     whole = [Span(t.offset, t.offset + t.length) for t in store.takes]
     tables = predict_takes(model, store.flow(flow_name), whole, settings)
+    return _with_targets(model, tables, humanoid, settings)
+
+
+def _with_targets(
+    model: StateRegressor, tables: dict[str, Tensor], humanoid: HumanoidModel, settings: RegressorSettings
+) -> dict[str, Tensor]:
+    """``tables`` with what the environment reads beside the predictions themselves."""
+    if settings.cross_fit > 1:
+        # The contexts of several fits do not share their axes; the states they are decoded to do.
+        tables["visual_context"] = model.normalise(tables["humanoid_state"])
     tables["joint_targets"] = joint_targets(tables["humanoid_state"], humanoid)
     return {key: tables[key] for key in TABLE_KEYS}
 
@@ -135,19 +145,33 @@ def _train(
     states = humanoid_state(store.reference).float()
     pieces = split_takes(store.takes, config["data"]["split"], "train", supported_only=False)
     fragments = [Span(*span) for span in global_spans(store, pieces)]
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(settings.seed)
-        encoder = build_encoder(config["vision"]["encoder"])
-    model = build_regressor(encoder, states, fragments, settings, encoder.features)
     mirror = state_mirror(humanoid.skeleton) if settings.mirror else None
-    frames = sum(f.stop - f.start for f in fragments)
-    print(f"training the state regressor on {frames} frames", file=sys.stderr, flush=True)
-    part = weights.with_name(weights.name + ".part")
     weights.parent.mkdir(parents=True, exist_ok=True)
-    result = train_regressor(
-        model, flow, states, fragments, settings, mirror, _report, partial(_save_part, part), _load_part(part)
-    )
+    parts: list[Path] = []
+
+    def fit(spans: list[Span], label: str) -> tuple[StateRegressor, TrainingResult]:
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(settings.seed)
+            encoder = build_encoder(config["vision"]["encoder"])
+        model = build_regressor(encoder, states, spans, settings, encoder.features)
+        frames = sum(f.stop - f.start for f in spans)
+        print(f"training the state regressor{label.replace('.', ' ')} on {frames} frames", file=sys.stderr, flush=True)
+        parts.append(weights.with_name(f"{weights.name}{label}.part"))
+        saved = _load_part(parts[-1])
+        return model, train_regressor(
+            model, flow, states, spans, settings, mirror, _report, partial(_save_part, parts[-1]), saved
+        )
+
+    model, result = fit(fragments, "")
     tables = _predict(model, store, humanoid, flow_name, settings)
+    if settings.cross_fit > 1:
+        for number, block in enumerate(cross_fit_blocks(fragments, settings.cross_fit)):
+            others = without_block(fragments, block, settings.margin, settings.margin)
+            seen = _predict(fit(others, f".fold{number}")[0], store, humanoid, flow_name, settings)
+            for key in ("humanoid_state", "visual_features", "joint_targets"):
+                for span in block:
+                    tables[key][span.start : span.stop] = seen[key][span.start : span.stop]
+        tables = _with_targets(model, tables, humanoid, settings)
     # JSON knows no NaN: nothing was held out, nothing is known.
     errors = {
         key: None if math.isnan(value) else value
@@ -161,7 +185,8 @@ def _train(
         weights, metadata=metadata_of("regressor", states.shape[1], result.best_epoch, 0, 0.0)
     )
     store.write_table(name, tables, card)
-    shutil.rmtree(part, ignore_errors=True)
+    for part in parts:
+        shutil.rmtree(part, ignore_errors=True)
 
 
 def _save_part(part: Path, state: State) -> None:

@@ -49,6 +49,34 @@ def split_validation(fragments: Sequence[Span], share: float, margin: int) -> tu
     return train, held_out
 
 
+def cross_fit_blocks(fragments: Sequence[Span], folds: int) -> list[list[Span]]:
+    """``folds`` lists of stretches that together are ``fragments``: each cut into as many equal pieces of time.
+
+    A fragment shorter than ``folds`` frames gives some folds nothing.
+    """
+    cuts = [[f.start + (f.stop - f.start) * k // folds for k in range(folds + 1)] for f in fragments]
+    return [[Span(c[k], c[k + 1]) for c in cuts if c[k] < c[k + 1]] for k in range(folds)]
+
+
+def without_block(fragments: Sequence[Span], block: Sequence[Span], margin: int, shortest: int) -> list[Span]:
+    """What is left of ``fragments`` without ``block`` and ``margin`` frames either side of it.
+
+    Args:
+        fragments: stretches.
+        block: stretches of the same frames, at most one in each fragment.
+        margin: frames.
+        shortest: frames; shorter pieces are dropped.
+    """
+    left = []
+    for fragment in fragments:
+        inside = [b for b in block if fragment.start <= b.start and b.stop <= fragment.stop]
+        pieces = [fragment]
+        if inside:
+            pieces = [Span(fragment.start, inside[0].start - margin), Span(inside[0].stop + margin, fragment.stop)]
+        left += [p for p in pieces if p.stop - p.start >= shortest]
+    return left
+
+
 def training_windows(fragments: Sequence[Span], length: int, margin: int, generator: torch.Generator) -> list[Window]:
     """One epoch's windows, in random order.
 

@@ -37,6 +37,8 @@ class RegressorSettings:
         save_every: epochs between calls of ``save``.
         encode_batch: frames a forward pass of the encoder without gradients.
         lookahead: frames the causal predictions may see ahead.
+        cross_fit: a training frame's predictions come from an F that never saw it, one of so many, each trained on the
+            other blocks of time; 1: from the F that learned it.
     """
 
     hidden: tuple[int, ...]
@@ -66,6 +68,7 @@ class RegressorSettings:
     save_every: int
     encode_batch: int
     lookahead: int
+    cross_fit: int
 
     def __post_init__(self) -> None:
         def check(ok: bool, name: str, cause: str) -> None:
@@ -74,6 +77,7 @@ class RegressorSettings:
 
         check(self.optimiser in ("adam", "adamw"), "optimiser", "must be adam or adamw")
         check(self.schedule in ("constant", "one_cycle"), "schedule", "must be constant or one_cycle")
+        check(self.cross_fit >= 1, "cross_fit", "must be at least 1")
         check(self.fragment_length > 2 * self.margin >= 0, "margin", "must leave frames of the fragment")
         check(0 <= self.validation_share < 0.5, "validation_share", "must lie in [0, 0.5)")
         check(0 <= self.ema_decay < 1, "ema_decay", "must lie in [0, 1)")
