@@ -16,12 +16,13 @@ from typing import Any
 import numpy as np
 import torch
 from tensordict.nn import TensorDictModuleBase
-from torchrl.envs import Compose, EnvBase, TransformedEnv
+from torchrl.envs import EnvBase, TransformedEnv
 
 from egopose.config import compose_config
 from egopose.data.preparation import store_folder
 from egopose.data.store import TakeStore
 from egopose.envs import build as envs
+from egopose.envs.transformed import TransformedEgoPoseEnv
 from egopose.envs.transforms import StateNormalizer, TrackingError, VisualContext
 from egopose.errors import InputError
 from egopose.evaluation.report import TakeVideo
@@ -30,7 +31,7 @@ from egopose.material import Material, load_material, motion_material, run_mater
 from egopose.models.policy import PolicySettings, build_actor, build_critic
 from egopose.training.checkpoint import RunCheckpoint, find_checkpoint, read_json, require, verify
 from egopose.training.collectors import CollectorSettings, build_collector, transform_state
-from egopose.training.loop import Evaluation, LoopSettings, Run
+from egopose.training.loop import Evaluation, LoopSettings, Run, interrupts_held
 from egopose.training.ppo import PPO, PPOSettings
 
 __all__ = [
@@ -115,7 +116,7 @@ def build_env(
         transforms.insert(
             0, TrackingError(material.states, _state_scale(material, float(config["regressor"]["std_floor"])))
         )
-    return TransformedEnv(base, Compose(*transforms))
+    return TransformedEgoPoseEnv(base, *transforms)
 
 
 def _state_scale(material: Material, floor: float) -> torch.Tensor:
@@ -163,12 +164,13 @@ def build_run(config: Mapping[str, Any], folder: Path, material: Material) -> Ru
     actor, critic = build_networks(config, material, probe)
     action_size = int(probe.action_spec.shape[-1])
     probe.close()
-    collector = build_collector(
-        collector_settings,
-        partial(_training_env, config, material, collector_settings, folder),
-        actor,
-        settings.steps_per_iteration,
-    )
+    with interrupts_held():
+        collector = build_collector(
+            collector_settings,
+            partial(_training_env, config, material, collector_settings, folder),
+            actor,
+            settings.steps_per_iteration,
+        )
     ppo = PPO(actor, critic, ppo_settings)
     return Run(ppo, collector, settings, collector_settings, folder, config, action_size)
 

@@ -8,6 +8,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
+from multiprocessing import resource_tracker
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -29,6 +30,10 @@ Evaluation = Callable[[int], Mapping[str, float]]
 
 class TrainingStopped(RuntimeError):
     """Something outside the run ended it: a full disk, a process that was killed. Its checkpoints are whole."""
+
+
+class WorkerLost(RuntimeError):
+    """A process that collects has ended."""
 
 
 @dataclass(frozen=True)
@@ -225,6 +230,10 @@ def train(run: Run, loggers: Sequence[Scalars], evaluate: Evaluation | None = No
         except TrainingDiverged as error:
             # Nothing of it is saved: some of this iteration's gradient steps may have been the ones that led here.
             raise TrainingDiverged(f"{error}; {_what_is_kept(run)}") from error
+        except WorkerLost as error:
+            # It is missed before anything of the iteration was learned: the one before is whole.
+            run.save()
+            raise TrainingStopped(f"{error}; {_what_is_kept(run)}") from error
         except (OSError, checkpoints.SaveFailed) as error:
             raise TrainingStopped(f"{error}; {_what_is_kept(run)}") from error
         finally:
@@ -273,7 +282,9 @@ def iterate(run: Run, batches: Iterator[TensorDictBase]) -> dict[str, float]:
     threads, counters = run.collector_settings, run.counters
     clock = [time.monotonic()]
     collectors.set_threads(threads.threads)
-    batch = next(batches)
+    with worker_watch(run.collector):
+        run.collector.update_policy_weights_()
+        batch = next(batches)
     clock.append(time.monotonic())
     collectors.set_threads(threads.update_threads)
     rows = run.ppo.advantages(batch)
@@ -282,7 +293,6 @@ def iterate(run: Run, batches: Iterator[TensorDictBase]) -> dict[str, float]:
         learning = run.ppo.update(rows)
     finally:
         collectors.set_threads(threads.threads)
-    run.collector.update_policy_weights_()
     clock.append(time.monotonic())
 
     counters.iteration += 1
@@ -344,6 +354,47 @@ def stop_signals() -> Iterator[threading.Event]:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
+
+
+@contextmanager
+def interrupts_held() -> Iterator[None]:
+    """Ctrl-C waits until the end; processes started meanwhile never get it.
+
+    A terminal sends it to all processes at once, and workers that stop at it would take their iteration with them.
+    """
+    if not hasattr(signal, "pthread_sigmask"):  # Windows
+        yield
+        return
+    resource_tracker.ensure_running()  # its start would lift the mask
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+@contextmanager
+def worker_watch(collector: Any) -> Iterator[None]:
+    """Where one of the collector's processes ends, raises :class:`WorkerLost` instead of waiting for it for ever."""
+    workers = getattr(getattr(collector, "_collector", collector), "procs", ())
+    if not workers or not hasattr(signal, "SIGCHLD") or threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    def look(number: int = 0, frame: FrameType | None = None) -> None:
+        # TorchRL ends all of them when it misses one.
+        if codes := [str(worker.exitcode) for worker in workers if not worker.is_alive()]:
+            raise WorkerLost(f"worker processes ended, exit codes {', '.join(codes)} (-9: killed, often for memory)")
+
+    before = signal.signal(signal.SIGCHLD, look)
+    try:
+        look()
+        yield
+    except (OSError, EOFError, RuntimeError):
+        look()  # the end of a worker may show first in its pipe
+        raise
+    finally:
+        signal.signal(signal.SIGCHLD, before)
 
 
 def _end(settings: LoopSettings, counters: Counters, seconds_after_next: float, stop: threading.Event) -> str | None:
