@@ -24,6 +24,7 @@ from egopose.errors import InputError
 from egopose.files import write_text_whole
 from egopose.humanoid.model import HumanoidModel
 from egopose.regression import kept_tables, regressor_tables
+from egopose.untrusted import read_json
 
 PROVENANCE = "provenance.json"
 
@@ -90,7 +91,7 @@ def require_same_store(run: Path, fingerprint: str) -> None:
     if not path.is_file():
         return
     try:
-        noted = json.loads(path.read_text())["store_fingerprint"]
+        noted = read_json(path, "store_fingerprint")["store_fingerprint"]
     except (ValueError, TypeError, KeyError) as error:
         raise InputError(path, "store_fingerprint", f"is damaged: {error!r}") from None
     if noted != fingerprint:

@@ -36,6 +36,7 @@ from egopose.training.fragments import Span, cross_fit_blocks, without_block
 from egopose.training.predictions import predict_takes
 from egopose.training.regressor_settings import RegressorSettings
 from egopose.training.supervised import Progress, State, TrainingResult, build_regressor, train_regressor
+from egopose.untrusted import read_json as read_json_file
 from egopose.vision.encoders import build_encoder
 
 TABLE_KEYS = ("humanoid_state", "visual_context", "visual_features", "joint_targets")
@@ -112,7 +113,7 @@ def _is_trained(store: TakeStore, name: str) -> bool:
 def _weights_checksums(folder: Path) -> dict[str, str]:
     """Of the tensors and the settings they belong to; the manifest beside them also tells when they were saved."""
     try:
-        found = json.loads((folder / CHECKSUMS).read_text())
+        found = read_json_file(folder / CHECKSUMS, CHECKSUMS)
     except (OSError, ValueError) as error:
         raise InputError(folder, CHECKSUMS, f"cannot be read: {error}") from None
     return {file: digest for file, digest in found.items() if file.startswith("components/")}

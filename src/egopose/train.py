@@ -16,7 +16,7 @@ from hydra.core.hydra_config import HydraConfig  # noqa: E402
 from hydra.types import RunMode  # noqa: E402
 from omegaconf import DictConfig  # noqa: E402
 
-from egopose.config import config_dir, register_resolvers, resolved  # noqa: E402
+from egopose.config import check_arguments, config_dir, register_resolvers, resolved  # noqa: E402
 from egopose.errors import InputError  # noqa: E402
 
 if TYPE_CHECKING:
@@ -131,6 +131,11 @@ def hydra_main(config: DictConfig) -> float:
 
 def main() -> None:
     """The command. A run directory that is not there is refused before Hydra would make it."""
+    try:
+        check_arguments(sys.argv[1:])
+    except InputError as error:
+        print(f"error: {error}", file=sys.stderr)
+        raise SystemExit(2) from None
     for word in sys.argv[1:]:
         name, _, value = word.partition("=")
         if name != "resume" or value in ("", "null"):

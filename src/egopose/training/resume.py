@@ -10,13 +10,12 @@ from pathlib import Path
 from typing import Any
 
 from hydra.core.override_parser.overrides_parser import OverridesParser
-from omegaconf import OmegaConf
-from omegaconf.errors import OmegaConfBaseException
-from yaml import YAMLError
 
 from egopose.errors import InputError
 from egopose.files import write_text_whole
 from egopose.training.checkpoint import read_json, recover
+from egopose.untrusted import read_json as read_json_file
+from egopose.untrusted import read_yaml
 
 #: What a resumed run may change: how long it goes on, what it keeps, where it is logged, on how many threads it runs.
 CHANGEABLE = (
@@ -98,11 +97,11 @@ def mark_finished(folder: Path, config: Mapping[str, Any], figures: Mapping[str,
 def finished(folder: Path, config: Mapping[str, Any]) -> dict[str, Any] | None:
     """What :func:`mark_finished` noted, None where there is more to do under ``config``'s budget."""
     path = folder / FINISHED
-    try:
-        noted = dict(json.loads(path.read_text()))
-        budget = noted["budget"]
-    except FileNotFoundError:
+    if not path.exists():
         return None
+    try:
+        noted = dict(read_json_file(path, FINISHED))
+        budget = noted["budget"]
     except (ValueError, TypeError, KeyError) as error:
         raise InputError(path, "budget", f"is damaged: {error!r}; without this file the run goes on") from None
     return noted if budget == {field: _select(config, field) for field in BUDGET} else None
@@ -138,10 +137,10 @@ def _saved_config(folder: Path, checkpoint: Path | None) -> dict[str, Any] | Non
     path = folder / "config.yaml"
     written: dict[str, Any] | None = None
     if path.is_file():
-        try:
-            written = {str(k): v for k, v in dict(OmegaConf.to_container(OmegaConf.load(path))).items()}  # type: ignore[arg-type]
-        except (OSError, ValueError, TypeError, YAMLError, OmegaConfBaseException) as error:
-            raise InputError(path, "config.yaml", f"cannot be read: {error}") from None
+        found = read_yaml(path, "config.yaml")
+        if not isinstance(found, dict):
+            raise InputError(path, "config.yaml", "cannot be read: is no mapping")
+        written = {str(key): value for key, value in found.items()}
     if checkpoint is None:
         return written
     config = dict(read_json(checkpoint, "config"))

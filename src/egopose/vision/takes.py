@@ -15,6 +15,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from egopose.errors import InputError
 from egopose.motion.rotations import Array
+from egopose.untrusted import read_json
 from egopose.vision.gl import choose_backend
 from egopose.vision.rendering import CameraConfig, render_wearer_video
 from egopose.vision.rooms import RoomConfig, room_seed
@@ -90,7 +91,7 @@ def is_rendered(job: RenderJob, config: RenderConfig) -> bool:
     if not (job.path.is_file() and record.is_file()):
         return False
     try:
-        return json.loads(record.read_text())["fingerprint"] == job_fingerprint(job, config)
+        return read_json(record, "fingerprint")["fingerprint"] == job_fingerprint(job, config)
     except (ValueError, KeyError, TypeError):
         return False
 
