@@ -1,6 +1,8 @@
 """``python -m egopose.bench VERB [--json] [--rounds N] [key=value ...]``: measure the program's own parts.
 
 env: the collection loop beside MuJoCo's own speed.
+features: from an MP4 to visual features beside decoding alone.
+scaling: the cost of every part of an iteration, and the memory of workers that share the data.
 resume: a training killed at random moments beside the same one left alone.
 """
 
@@ -19,7 +21,7 @@ from importlib import import_module  # noqa: E402
 from egopose.errors import InputError  # noqa: E402
 
 #: Verbs and how many rounds each takes unless told; a verb's module is ``egopose.benchmarks.<verb>``.
-VERBS = {"env": 9, "resume": 50}
+VERBS = {"env": 9, "resume": 50, "features": 9, "scaling": 5}
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from typing import Any
 
+import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
@@ -55,26 +56,22 @@ def write_simulation(collector: Collector, state: Mapping[str, Any]) -> None:
 class WorkerCollector(Collector):
     """The collector inside a worker, with what the learner asks of it between two batches."""
 
-    def transform_state(self) -> State:
-        """State of the environment's transforms, copied."""
-        return {key: value.clone() for key, value in self.env.state_dict().items()}
+    def report(self) -> State:
+        """``transforms``: state of the environment's transforms; ``simulation``: worlds, what the policy sees next, and
+        the random numbers (``rng``) its actions are drawn by. All packed.
+        """
+        simulation = {**read_simulation(self), "rng": torch.get_rng_state()}
+        return _packed({"transforms": dict(self.env.state_dict()), "simulation": simulation})
 
-    def load_transform_state(self, state: Mapping[str, Any]) -> None:
-        """Set it."""
-        self.env.load_state_dict(state)
+    def load_transform_state(self, packed: State) -> None:
+        """Set what a report gives as ``transforms``."""
+        self.env.load_state_dict(_unpacked(packed))
 
-    def simulation_state(self) -> State:
-        """Worlds, what the policy sees next, and the random numbers its actions are drawn by."""
-        return {**read_simulation(self), "rng": torch.get_rng_state()}
-
-    def load_simulation_state(self, state: Mapping[str, Any]) -> None:
-        """The opposite of :meth:`simulation_state`."""
+    def load_simulation_state(self, packed: State) -> None:
+        """Set what a report gives as ``simulation``."""
+        state = _unpacked(packed)
         write_simulation(self, state)
         torch.set_rng_state(state["rng"])
-
-    def report(self) -> tuple[State, State]:
-        """What a worker gives at the end of a batch: :meth:`transform_state` and :meth:`simulation_state`."""
-        return self.transform_state(), self.simulation_state()
 
 
 class _AnnouncingCollector(MultiAsyncCollector):
@@ -144,10 +141,10 @@ class Workers:
                 auto_register_policy_transforms=False,
             )
         self.update_policy_weights_()
-        reports = self._call_all("report")
-        self.simulation: list[State] = [simulation for _, simulation in reports]
+        reports = self._reports()
+        self.simulation: list[State] = [report["simulation"] for report in reports]
         # What the workers' first resets counted is still theirs to report.
-        self.transforms = without_counts(reports[0][0])
+        self.transforms = without_counts(reports[0]["transforms"])
         self._given = [self.transforms] * workers
         if kind == "multi_async":
             self._collector.announce = self._exchange
@@ -168,7 +165,7 @@ class Workers:
 
     def load_transform_state(self, state: Mapping[str, Any]) -> None:
         """Give all workers these statistics. Before the first batch only: a busy worker would lose its batch."""
-        self._call_all("load_transform_state", [(dict(state),)] * self.count)
+        self._call_all("load_transform_state", [(_packed(state),)] * self.count)
         self.transforms = dict(state)
         self._given = [self.transforms] * self.count
 
@@ -180,7 +177,7 @@ class Workers:
         """
         if len(states) != self.count:
             raise ValueError(f"is of {len(states)} workers, this run has {self.count}")
-        self._call_all("load_simulation_state", [(dict(state),) for state in states])
+        self._call_all("load_simulation_state", [(_packed(state),) for state in states])
         self.simulation = [dict(state) for state in states]
 
     def shutdown(self) -> None:
@@ -190,17 +187,22 @@ class Workers:
             self._end_ray()
 
     def _exchange_all(self) -> None:
-        reports = self._call_all("report")
-        states, self.simulation = [report[0] for report in reports], [report[1] for report in reports]
+        reports = self._reports()
+        self.simulation = [report["simulation"] for report in reports]
+        states = [report["transforms"] for report in reports]
         self.transforms = merge_states(self.transforms, states, self._given)
-        self._call_all("load_transform_state", [(self.transforms,)] * self.count)
+        self._call_all("load_transform_state", [(_packed(self.transforms),)] * self.count)
         self._given = [self.transforms] * self.count
 
     def _exchange(self, number: int) -> None:
-        state, self.simulation[number] = self._call(number, "report")
-        self.transforms = merge_states(self.transforms, [state], [self._given[number]])
-        self._call(number, "load_transform_state", self.transforms)
+        report = _unpacked(self._call(number, "report"))
+        self.simulation[number] = report["simulation"]
+        self.transforms = merge_states(self.transforms, [report["transforms"]], [self._given[number]])
+        self._call(number, "load_transform_state", _packed(self.transforms))
         self._given[number] = self.transforms
+
+    def _reports(self) -> list[State]:
+        return [_unpacked(report) for report in self._call_all("report")]
 
     def _call_all(self, method: str, arguments: list[tuple[Any, ...]] | None = None) -> list[Any]:
         return self._collector.map_fn(method, arguments)
@@ -263,6 +265,19 @@ def _ray_collector(
         collector_kwargs=[{"auto_register_policy_transforms": False, "track_traj_ids": False} for _ in makers],
         remote_configs={"num_cpus": cpus},
     )
+
+
+def _packed(state: Mapping[str, Any]) -> State:
+    """Arrays in the place of tensors: torch would send each tensor as a file of shared memory, many times slower."""
+    return {key: _packed(value) if isinstance(value, Mapping) else value.numpy() for key, value in state.items()}
+
+
+def _unpacked(state: Mapping[str, Any]) -> State:
+    # Copied: what Ray brings is read-only.
+    return {
+        key: _unpacked(value) if isinstance(value, Mapping) else torch.from_numpy(np.array(value))
+        for key, value in state.items()
+    }
 
 
 def _path(key: Any) -> tuple[str, ...]:
