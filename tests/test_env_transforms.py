@@ -12,6 +12,7 @@ from tensordict import TensorDict
 from torchrl.envs import Compose, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
+from egopose.envs.transformed import TransformedEgoPoseEnv
 from egopose.envs.transforms import StateNormalizer, TrackingError, VisualContext
 
 ROWS = arrays(np.float64, st.tuples(st.integers(1, 12), st.just(3)), elements=st.floats(-1e4, 1e4, width=32))
@@ -219,3 +220,34 @@ def test_reset_worlds_see_their_new_start_and_the_others_what_they_saw() -> None
     np.testing.assert_allclose(again["tracking_error"][fresh], expected[fresh], rtol=1e-5, atol=1e-5)
     assert not torch.equal(again["tracking_error"][fresh], before[fresh])
     assert torch.equal(again["tracking_error"][[1, 3]], before[[1, 3]])
+
+
+def stepped_both_ways() -> tuple[TransformedEgoPoseEnv, TransformedEgoPoseEnv]:
+    size = environment(1).observation_spec["humanoid_state"].shape[-1]
+    table = torch.randn(65, size, generator=torch.Generator().manual_seed(1))
+    tracking = [TrackingError(table, torch.ones(size)) for _ in range(2)]
+    context = [VisualContext(table[:, :16]) for _ in range(2)]
+    mine, theirs = (
+        TransformedEgoPoseEnv(environment(5, seed=3), tracking[i], context[i], StateNormalizer(size)) for i in range(2)
+    )
+    return mine, theirs
+
+
+def test_stepping_and_resetting_at_once_is_torchrls_own_to_the_bit() -> None:
+    mine, theirs = stepped_both_ways()
+    generator = torch.Generator().manual_seed(0)
+    a, b = mine.reset(), theirs.reset()
+    resets = 0
+    for _ in range(40):
+        action = 0.3 * torch.randn(*mine.action_spec.shape, generator=generator)
+        before, a = mine.step_and_maybe_reset(a.set("action", action))
+        same_before, b = TransformedEnv.step_and_maybe_reset(theirs, b.set("action", action))
+        ended = before["next", "done"].squeeze(-1)
+        assert (before == same_before.select(*before.keys(True, True))).all()
+        assert set(same_before.keys(True, True)) - set(before.keys(True, True)) <= {"action"}
+        assert (a == b.select(*a.keys(True, True))).all()
+        assert set(b.keys(True, True)) - set(a.keys(True, True)) == {"action"}
+        resets += int(ended.sum())
+    assert resets > 5
+    for name, statistic in mine.state_dict().items():
+        torch.testing.assert_close(statistic, theirs.state_dict()[name], rtol=0, atol=0)

@@ -110,15 +110,22 @@ class EgoPoseEnv(EnvBase):
         else:
             worlds = mask.reshape(self.batch_size).nonzero().squeeze(-1)
         if len(worlds):
-            episodes = self.starts(worlds, self._generator)
-            self._take[worlds], self._start[worlds], self._stop[worlds] = episodes.take, episodes.start, episodes.stop
-            self._frame[worlds] = episodes.start
             if tensordict is not None and "initial_qpos" in tensordict:
-                qpos, qvel = tensordict["initial_qpos"][worlds], tensordict["initial_qvel"][worlds]
+                self._begin(worlds, tensordict["initial_qpos"][worlds], tensordict["initial_qvel"][worlds])
             else:
-                qpos, qvel = self.problem.first_state(episodes.start)
-            self.place(worlds, qpos, qvel)
+                self._begin(worlds)
         return self.observe()
+
+    def begin(self, worlds: Tensor) -> TensorDict:
+        """Begin an episode in each of ``worlds [n]``; their first observations, batch ``[n]``."""
+        self._begin(worlds)
+        return self.observe(worlds)
+
+    def _begin(self, worlds: Tensor, *state: Tensor) -> None:
+        episodes = self.starts(worlds, self._generator)
+        self._take[worlds], self._start[worlds], self._stop[worlds] = episodes.take, episodes.start, episodes.stop
+        self._frame[worlds] = episodes.start
+        self.place(worlds, *(state or self.problem.first_state(episodes.start)))
 
     def place(self, worlds: Tensor, qpos: Tensor, qvel: Tensor) -> None:
         """Put ``worlds [n]`` at ``qpos [n, 59]`` and ``qvel [n, 58]`` without touching their time or episode.
@@ -130,29 +137,36 @@ class EgoPoseEnv(EnvBase):
             raise ValueError("a world cannot be placed at a state that is not finite")
         self.physics.set_state(worlds.numpy(), qpos.double().numpy(), qvel.double().numpy())
 
-    def observe(self) -> TensorDict:
-        """The present observation of all worlds, as a reset would return it (after :meth:`place`)."""
-        n = self.batch_size[0]
+    def observe(self, worlds: Tensor | None = None) -> TensorDict:
+        """The present observation of ``worlds [n]`` (default all), as a reset would return it (after :meth:`place`)."""
+        # The state z needs no kinematics, and concatenating makes a copy of it. All worlds at once even for a few: how
+        # matrix products round depends on their shape.
+        z = self.problem.observation(
+            {"qpos": torch.from_numpy(self.physics.qpos), "qvel": torch.from_numpy(self.physics.qvel)}
+        ).float()
+        rows = slice(None) if worlds is None else worlds
+        z = z[rows]
+        size = z.shape[:1]
+        terms = torch.zeros(*size, len(self.problem.reward.names)).split(1, dim=-1)
         flags = ("fallen", "diverged", "done", "terminated", "truncated")
-        terms = {k: torch.zeros(n, 1) for k in self.problem.reward.names}
-        # The state z needs no kinematics; the copy that it is of the simulation's memory is made in it.
-        moving = {"qpos": torch.from_numpy(self.physics.qpos), "qvel": torch.from_numpy(self.physics.qvel)}
         return TensorDict(
             {
-                **self._clock(),
-                "humanoid_state": self.problem.observation(moving).float(),
-                "reward_terms": TensorDict(terms, batch_size=self.batch_size),
-                **{k: torch.zeros(n, 1, dtype=torch.bool) for k in flags},
+                **self._clock(rows),
+                "humanoid_state": z,
+                "reward_terms": TensorDict(dict(zip(self.problem.reward.names, terms, strict=True)), batch_size=size),
+                **{k: torch.zeros(*size, 1, dtype=torch.bool) for k in flags},
             },
-            batch_size=self.batch_size,
+            batch_size=size,
         )
 
-    def _clock(self) -> dict[str, Tensor]:
+    def _clock(self, rows: Tensor | slice = slice(None)) -> dict[str, Tensor]:
+        frame, start, stop = self._frame[rows, None], self._start[rows, None], self._stop[rows, None]
+        # Copies: a reset writes into the counters.
         return {
-            "frame": self._frame[:, None].clone(),
-            "episode_start": self._start[:, None].clone(),
-            "episode_stop": self._stop[:, None].clone(),
-            "episode_step": (self._frame - self._start)[:, None],
+            "frame": frame.clone(),
+            "episode_start": start.clone(),
+            "episode_stop": stop.clone(),
+            "episode_step": frame - start,
         }
 
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
