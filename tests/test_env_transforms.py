@@ -12,6 +12,7 @@ from tensordict import TensorDict
 from torchrl.envs import Compose, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
+from egopose.envs.problem import TakeTable
 from egopose.envs.transformed import TransformedEgoPoseEnv
 from egopose.envs.transforms import StateNormalizer, TrackingError, VisualContext
 
@@ -143,13 +144,15 @@ def test_state_round_trip_to_the_bit() -> None:
 
 # --- the tracking error --------------------------------------------------------------------------------------------
 
-STATES = torch.tensor([[1.0, 10.0], [2.0, 10.0], [4.0, 13.0]])
+# Two takes: three frames and one.
+STATES = torch.tensor([[1.0, 10.0], [2.0, 10.0], [4.0, 13.0], [9.0, 9.0]])
+TAKES = TakeTable(torch.tensor([0, 3]), torch.tensor([3, 1]), torch.zeros(2))
 SCALE = torch.tensor([0.5, 2.0])
 
 
 def error_of(state: list[list[float]], frame: list[int], clip: float = 5.0) -> list[list[float]]:
     td = TensorDict({"humanoid_state": torch.tensor(state), "frame": torch.tensor(frame)[:, None]}, [len(frame)])
-    return TrackingError(STATES, SCALE, clip)(td)["tracking_error"].tolist()
+    return TrackingError(STATES, TAKES.following(), SCALE, clip)(td)["tracking_error"].tolist()
 
 
 def test_tracking_error_by_hand() -> None:
@@ -157,8 +160,9 @@ def test_tracking_error_by_hand() -> None:
     assert error_of([[1.5, 8.0], [2.0, 11.0]], [0, 1]) == [[1.0, -1.0, 2.0, 0.0], [0.0, 0.5, 4.0, 1.5]]
 
 
-def test_after_the_last_frame_the_regressor_stands_still() -> None:
-    assert error_of([[4.0, 14.0]], [2]) == [[0.0, 0.5, 0.0, 0.0]]
+def test_after_a_takes_last_frame_the_regressor_stands_still() -> None:
+    """It does not go on to the next take's first."""
+    assert error_of([[4.0, 14.0], [9.0, 9.0]], [2, 3]) == [[0.0, 0.5, 0.0, 0.0], [0.0, 0.0, 0.0, 0.0]]
 
 
 def test_tracking_error_is_clipped_on_both_sides() -> None:
@@ -172,7 +176,7 @@ def tracking_env(n: int = 4) -> tuple[TransformedEnv, TrackingError, list[torch.
     size = env.observation_spec["humanoid_state"].shape[-1]
     generator = torch.Generator().manual_seed(1)
     table = torch.randn(env.problem.n_frames, size, generator=generator)
-    tracking = TrackingError(table, 0.5 + torch.rand(size, generator=generator))
+    tracking = TrackingError(table, env.problem.takes.following(), 0.5 + torch.rand(size, generator=generator), 5.0)
     raw: list[torch.Tensor] = []
     original = env.problem.observation
 
@@ -186,7 +190,7 @@ def tracking_env(n: int = 4) -> tuple[TransformedEnv, TrackingError, list[torch.
 
 def numpy_error(tracking: TrackingError, state: torch.Tensor, frame: torch.Tensor) -> np.ndarray:
     table, scale, rows = tracking.table.numpy(), tracking.scale.numpy(), frame.squeeze(-1).numpy()
-    now, ahead = table[rows], table[np.minimum(rows + 1, len(table) - 1)]
+    now, ahead = table[rows], table[np.where(rows == 39, 39, np.minimum(rows + 1, len(table) - 1))]
     return np.clip(np.concatenate([(state.numpy() - now) / scale, (ahead - now) / scale], axis=-1), -5, 5)
 
 
@@ -225,7 +229,8 @@ def test_reset_worlds_see_their_new_start_and_the_others_what_they_saw() -> None
 def stepped_both_ways() -> tuple[TransformedEgoPoseEnv, TransformedEgoPoseEnv]:
     size = environment(1).observation_spec["humanoid_state"].shape[-1]
     table = torch.randn(65, size, generator=torch.Generator().manual_seed(1))
-    tracking = [TrackingError(table, torch.ones(size)) for _ in range(2)]
+    following = problem().takes.following()
+    tracking = [TrackingError(table, following, torch.ones(size), 5.0) for _ in range(2)]
     context = [VisualContext(table[:, :16]) for _ in range(2)]
     mine, theirs = (
         TransformedEgoPoseEnv(environment(5, seed=3), tracking[i], context[i], StateNormalizer(size)) for i in range(2)

@@ -113,9 +113,11 @@ def build_env(
     if "tracking_error" in config["model"]["inputs"]:
         if material.states is None:
             raise InputError("configuration", "model.inputs", "tracking_error needs a trained state regressor")
-        transforms.insert(
-            0, TrackingError(material.states, _state_scale(material, float(config["regressor"]["std_floor"])))
-        )
+        if "tracking_error_clip" not in task:
+            raise InputError("configuration", "task.tracking_error_clip", "is missing")
+        scale = _state_scale(material, float(config["regressor"]["std_floor"]))
+        clip = float(task["tracking_error_clip"])
+        transforms.insert(0, TrackingError(material.states, material.takes.following(), scale, clip))
     return TransformedEgoPoseEnv(base, *transforms)
 
 

@@ -34,6 +34,12 @@ class TakeTable:
     lengths: Tensor
     lowest_head_height: Tensor
 
+    def following(self) -> Tensor:
+        """``[F]`` int64, the frame after each frame; of a take's last frame, itself."""
+        frames = torch.arange(int(self.lengths.sum()))
+        last = (self.offsets + self.lengths - 1).repeat_interleave(self.lengths)
+        return torch.minimum(frames + 1, last)
+
 
 @dataclass(frozen=True)
 class ActionSettings:

@@ -46,6 +46,8 @@ class TrackingError(Transform):
 
     Args:
         table: ``[F, S]``, the regressor's states in their own units.
+        following: ``[F]`` int64, the frame after each frame; of a take's last frame itself, where the regressor
+            stands still.
         scale: ``[S]``, what a unit of each number is divided by (a deviation).
         clip: bound of the scaled numbers.
         key: of what it writes, ``[..., 2 S]``: the scaled error, the regressor's scaled step to the next frame.
@@ -53,9 +55,11 @@ class TrackingError(Transform):
 
     scale: Tensor
 
-    def __init__(self, table: Tensor, scale: Tensor, clip: float = 5.0, key: str = "tracking_error") -> None:
+    def __init__(
+        self, table: Tensor, following: Tensor, scale: Tensor, clip: float, key: str = "tracking_error"
+    ) -> None:
         super().__init__(in_keys=["humanoid_state", "frame"], out_keys=[key])
-        self.table, self.clip = table, clip
+        self.table, self.following, self.clip = table, following, clip
         # A buffer: a policy must see other data in the units it was trained in.
         self.register_buffer("scale", scale)
 
@@ -63,9 +67,9 @@ class TrackingError(Transform):
         """Writes :attr:`out_keys` from the raw ``humanoid_state`` and ``frame``."""
         frame = tensordict["frame"].squeeze(-1)
         now = self.table[frame]
-        ahead = self.table[(frame + 1).clamp(max=len(self.table) - 1)]
-        error = torch.cat([tensordict["humanoid_state"] - now, ahead - now], dim=-1) / self.scale.repeat(2)
-        return tensordict.set(self.out_keys[0], error.clamp(-self.clip, self.clip))
+        ahead = self.table[self.following[frame]]
+        error = torch.stack([tensordict["humanoid_state"], ahead], dim=-2).sub_(now.unsqueeze(-2)).div_(self.scale)
+        return tensordict.set(self.out_keys[0], error.clamp_(-self.clip, self.clip).flatten(-2))
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         return self.forward(next_tensordict)
