@@ -24,6 +24,7 @@ from egopose.errors import InputError
 MAX_JSON_BYTES = 16 * 2**20
 MAX_YAML_BYTES = 2**18
 _MAX_YAML_VALUES = 50_000
+_MAX_YAML_DEPTH = 50
 
 #: The most a checkpoint's files may hold in sum: loading one copies it. Policies and regressors here take 1 to 100 MB.
 MAX_CHECKPOINT_BYTES = 512 * 2**20
@@ -78,7 +79,11 @@ def read_yaml(path: Path, field: str) -> Any:
         if path.stat().st_size > MAX_YAML_BYTES:
             raise InputError(path, field, f"is damaged: {path.stat().st_size} bytes; at most {MAX_YAML_BYTES} are read")
         text = path.read_text(encoding="utf-8")
+        depth = 0
         for count, event in enumerate(yaml.parse(text, Loader=yaml.SafeLoader)):
+            depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
+            if depth > _MAX_YAML_DEPTH:  # every level makes every further word slower
+                raise InputError(path, field, "is damaged: nested too deeply")
             if isinstance(event, yaml.AliasEvent):
                 raise InputError(path, field, f"line {event.start_mark.line + 1}: aliases are not read")
             if count > _MAX_YAML_VALUES:

@@ -104,7 +104,12 @@ class TakeStore:
         self.card: dict[str, Any] = card
         self.fps = float(card["fps"])
         self.takes = tuple(_take_info(path, row, number) for number, row in enumerate(card["takes"]))
-        self.frames_total = sum(t.length for t in self.takes)
+        self.frames_total = 0
+        for number, take in enumerate(self.takes):
+            if take.offset != self.frames_total:
+                cause = f"is {take.offset}, the takes before it end at {self.frames_total}"
+                raise InputError(path, f"takes[{number}].offset", cause)
+            self.frames_total += take.length
 
     @classmethod
     def open(cls, root: str | os.PathLike[str]) -> TakeStore:
@@ -187,7 +192,12 @@ class TakeStore:
     def flow_done(self, name: str) -> set[int]:
         """Takes whose flow is in."""
         path = self.root / "flow" / name / "done.json"
-        return {int(i) for i in read_json(path, "done")} if path.is_file() else set()
+        if not path.is_file():
+            return set()
+        done = read_json(path, "done")
+        if not isinstance(done, list) or not all(type(take) is int for take in done):
+            raise InputError(path, "done", "is damaged: must be a list of takes' numbers")
+        return set(done)
 
     def open_flow(self, name: str, size: int) -> Tensor:
         """The flow table to be filled; made on first use."""
@@ -260,7 +270,7 @@ def _take_info(path: Path, row: Any, number: int) -> TakeInfo:
     if not (0 <= take.offset < 2**40 and 0 <= take.length < 2**40):
         raise InputError(path, where, f"cannot be read: {take.length} frames from {take.offset} on")
     parts = Path(take.video).parts
-    inside = not Path(take.video).is_absolute() and ".." not in parts
+    inside = bool(parts) and not Path(take.video).is_absolute() and ".." not in parts
     if take.name in ("", ".", "..") or re.search(r"[/\\\0]", take.name) or (take.rendered and not inside):
         raise InputError(path, where, f"{take.name!r:.60}, {take.video!r:.60}: lies outside the store")
     return take

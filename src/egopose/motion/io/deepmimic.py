@@ -123,8 +123,9 @@ def read_deepmimic(path: str | Path) -> Motion:
 
 def _parse(path: Path) -> tuple[str, Array]:
     """The file's ``Loop`` and its frames ``[T, 44]``."""
+    text = read_text(path, _MAX_BYTES)
     try:
-        content = json.loads(read_text(path, _MAX_BYTES))
+        content = json.loads(text)
     except json.JSONDecodeError as error:
         raise InputError(path, f"line {error.lineno}", f"not JSON: {error.msg}") from error
     except ValueError as error:  # a whole number of thousands of digits
