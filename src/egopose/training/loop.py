@@ -282,8 +282,10 @@ def iterate(run: Run, batches: Iterator[TensorDictBase]) -> dict[str, float]:
     threads, counters = run.collector_settings, run.counters
     clock = [time.monotonic()]
     collectors.set_threads(threads.threads)
+    # Watched one by one: TorchRL takes an error in the first for a late answer and goes on.
     with worker_watch(run.collector):
         run.collector.update_policy_weights_()
+    with worker_watch(run.collector):
         batch = next(batches)
     clock.append(time.monotonic())
     collectors.set_threads(threads.update_threads)
