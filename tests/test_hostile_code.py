@@ -268,6 +268,23 @@ def test_a_hostile_checkpoint(name: str, tmp_path: Path) -> None:
     assert torch.equal(policy.weight, before)
 
 
+@pytest.mark.parametrize(
+    "config",
+    [
+        {"model": {"hidden": [60_000, 60_000]}},
+        {"model": {"hidden": [300] * 1000}},
+        {"model": {"context": {"hidden_size": 1e9}}},
+        {"vision": {"encoder": {"input_size": 512, "features": 2048, "channels": [64, 512]}}},
+        {"vision": {"workers": 10**6}},
+        {"vision": {"flow": {"working_size": float("nan")}}},
+    ],
+)
+def test_a_checkpoint_that_asks_for_too_much(config: dict[str, Any], tmp_path: Path) -> None:
+    RunCheckpoint({"config": config}).save(tmp_path / "c", metadata=metadata_of("toy", 2, 1, 2, 0.5))
+    with pytest.raises(InputError, match=r"at most|too large"):
+        read_json(tmp_path / "c", "config")
+
+
 YAMLS = {
     "object": "a: !!python/object/apply:os.mkdir [MARKER]\n",
     "name": "a: !!python/name:os.system\n",

@@ -281,3 +281,43 @@ def _check_state(folder: Path, name: str, state: Any) -> None:
             waiting.append(value["items"])
             if value.get("metadata") is not None:
                 waiting.append(value["metadata"])
+
+
+#: The largest networks, pictures and pools that a configuration in a checkpoint may ask for; ours are a tenth of it.
+_MAX_SETTINGS = {
+    **dict.fromkeys(("hidden", "hidden_size", "context_size", "features"), 2048),
+    **dict.fromkeys(("channels", "input_size"), 512),
+    **dict.fromkeys(("size", "working_size", "stored_size"), 1024),
+    **dict.fromkeys(("workers", "threads", "physics_threads", "update_threads"), 1024),
+    **dict.fromkeys(("encode_batch", "padding", "horizon"), 2**16),
+}
+_MAX_LAYERS = 8
+_MAX_ENCODER_WEIGHTS = 2**28
+
+
+def check_sizes(config: Any, source: Path) -> None:
+    """A stranger's configuration must not ask for networks that fill the memory before their weights are looked at.
+
+    Raises:
+        InputError: a width, a number of layers, a picture or a pool of workers beyond any use; names the key.
+    """
+    waiting = [config]
+    while waiting:
+        value = waiting.pop()
+        if isinstance(value, list):
+            waiting += value
+        if not isinstance(value, dict):
+            continue
+        waiting += value.values()
+        for key, limit in _MAX_SETTINGS.items():
+            sizes = value.get(key)
+            numbers = [n for n in (sizes if isinstance(sizes, list) else [sizes]) if isinstance(n, int | float)]
+            if len(numbers) > _MAX_LAYERS or any(not n <= limit for n in numbers):
+                raise InputError(source, key, f"{str(sizes)[:60]}: at most {limit}, and {_MAX_LAYERS} in a row")
+        side, features, channels = (value.get(k) for k in ("input_size", "features", "channels"))
+        if isinstance(side, int) and isinstance(features, int):
+            last = max([1, *(c for c in channels if isinstance(c, int))]) if isinstance(channels, list) else 1
+            if side * side * last * features > _MAX_ENCODER_WEIGHTS:
+                raise InputError(
+                    source, "input_size", f"{side}, with {last} channels and {features} features: too large"
+                )

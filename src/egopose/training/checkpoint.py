@@ -228,7 +228,9 @@ def read_json(path: str | Path, component: str) -> Any:
     records = Checkpoint.manifest(path)["components"]
     if component not in records:
         raise InputError(path, component, "is missing in the checkpoint")
-    return untrusted.read_json(Path(path) / records[component]["path"] / "value.json", component)
+    value = untrusted.read_json(Path(path) / records[component]["path"] / "value.json", component)
+    untrusted.check_sizes(value, Path(path))
+    return value
 
 
 def rotation(run_dir: str | Path, keep_last: int) -> CheckpointRotation:
