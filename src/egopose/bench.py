@@ -21,7 +21,7 @@ from importlib import import_module  # noqa: E402
 from egopose.errors import InputError  # noqa: E402
 
 #: Verbs and how many rounds each takes unless told; a verb's module is ``egopose.benchmarks.<verb>``.
-VERBS = {"env": 9, "resume": 50, "features": 9, "scaling": 5}
+VERBS = {"env": 9, "update": 5, "resume": 50, "features": 9, "scaling": 5}
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
