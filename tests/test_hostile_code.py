@@ -8,6 +8,7 @@ import os
 import pickle
 import re
 import shutil
+import subprocess
 import sys
 import warnings
 from collections.abc import Callable
@@ -56,6 +57,14 @@ def test_what_fuzzing_found_stays_mended(case: Path, readers: ModuleType, tmp_pa
     with pytest.raises(InputError) as caught:
         reader.read(path)
     assert len(str(caught.value)) < 400
+
+
+@pytest.mark.slow
+def test_the_fuzzer_runs_and_finds_nothing(tmp_path: Path) -> None:
+    pytest.importorskip("atheris")
+    command = [sys.executable, str(ROOT / "experiments/fuzzing/fuzz.py"), "--runs", "4000"]
+    subprocess.run([*command, "--output", str(tmp_path / "results.json")], check=True, timeout=300)
+    assert json.loads((tmp_path / "results.json").read_text())["inputs"] == 4000
 
 
 def test_the_source_reads_no_pickle() -> None:
