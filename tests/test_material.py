@@ -297,6 +297,20 @@ def test_a_damaged_part_is_named(copied: Path) -> None:
         regressor_tables(config, store, humanoid_of(config), flow)
 
 
+def test_a_feature_file_that_vanished_is_named_and_put_back_the_run_goes_on(copied: Path, untrainable: None) -> None:
+    """A running training keeps what it has mapped; see test_survival.py."""
+    config = configuration(copied)
+    (file,) = (copied / "store" / "tables").glob("*/visual_context.memmap")
+    file.rename(copied / "elsewhere")
+    with pytest.raises(InputError, match=r"visual_context\.memmap is cut off or missing") as caught:
+        pipeline.run_material(config, copied / "run")
+    assert str(file.parent) in str(caught.value)
+    (copied / "elsewhere").rename(file)
+    run = pipeline.build_run(config, copied / "run", pipeline.run_material(config, copied / "run"))
+    run.restore(find_checkpoint(copied / "run"))
+    assert run.counters.iteration == 1
+
+
 # --- a quiet start ---------------------------------------------------------------------------------------------------
 
 
