@@ -157,7 +157,7 @@ def test_with_neither_regressor_a_run_is_refused_and_nothing_trained(copied: Pat
 
 
 def test_a_run_of_another_store_is_refused(copied: Path, untrainable: None, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(preparation, "PREPARATION_VERSION", 2)
+    monkeypatch.setattr(preparation, "PREPARATION_VERSION", preparation.PREPARATION_VERSION + 1)
     with pytest.raises(InputError, match=r"provenance\.json: store_fingerprint: the run was trained on a store"):
         pipeline.load_agent(copied / "run", which="latest")
     monkeypatch.undo()
@@ -188,7 +188,7 @@ def test_the_preparations_version_is_part_of_fingerprint_and_folder(
     config = configuration(made)
     config["data"] = {**config["data"], "store": None}
     first, folder = fingerprint_of(config), store_folder(config)
-    monkeypatch.setattr(preparation, "PREPARATION_VERSION", 2)
+    monkeypatch.setattr(preparation, "PREPARATION_VERSION", preparation.PREPARATION_VERSION + 1)
     assert fingerprint_of(config) != first
     assert store_folder(config) != folder
     with pytest.raises(InputError, match="another version of the preparation"):
@@ -240,7 +240,7 @@ def test_a_killed_process_holds_nothing(tmp_path: Path) -> None:
 
 
 def test_a_failed_preparation_holds_nothing(made: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(preparation, "PREPARATION_VERSION", 2)
+    monkeypatch.setattr(preparation, "PREPARATION_VERSION", preparation.PREPARATION_VERSION + 1)
     with pytest.raises(InputError):
         prepare(configuration(made), progress=False, flow=False)
     with (made / "store.lock").open("w") as file:

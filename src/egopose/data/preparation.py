@@ -52,9 +52,7 @@ def fingerprint_of(config: Mapping[str, Any]) -> str:
         [s.name, s.subject, s.motion.stat().st_size, str(s.video), s.sync_offset, s.options, s.mapping]
         for s in find_sources(data)
     ]
-    parts = [sources, config["humanoid"], data.get("preparation"), config["sim"]["control_hz"]]
-    if PREPARATION_VERSION != 1:  # stores of version 1 were made before versions were counted
-        parts.append(PREPARATION_VERSION)
+    parts = [sources, config["humanoid"], data.get("preparation"), config["sim"]["control_hz"], PREPARATION_VERSION]
     return hashlib.sha256(json.dumps(parts, sort_keys=True, default=str).encode()).hexdigest()
 
 
