@@ -262,3 +262,18 @@ def test_fall_is_a_head_below_the_take(body) -> None:
     state["xpos"][:, humanoid.head, 2] = torch.tensor([1.41, 1.39], dtype=torch.float64)
     head = state["xpos"][:, humanoid.head, 2]
     assert fallen(head, torch.full((2,), 1.5, dtype=torch.float64), 0.1).tolist() == [False, True]
+
+
+@pytest.mark.parametrize(
+    "reward", [rewards.HeadingFrameReward(WEIGHTS, SCALES), rewards.WorldFrameReward(WORLD_WEIGHTS, WORLD)]
+)
+def test_every_equation_stays_on_the_device_of_its_tensors(body, reward: rewards.Reward) -> None:
+    """On ``meta`` tensors a constant made on another device, or a value read on the host, raises."""
+    _, reference, layout = body
+    far = obs.BodyLayout(layout.parents.to("meta"), layout.end_effectors.to("meta"))
+    view = obs.BodyView({k: v[:4].to("meta") for k, v in reference.items()}, far)
+    total, terms = reward(view, view, torch.zeros(4, device="meta"))
+    z = view.humanoid_state
+    low = fallen(view.xpos[:, 6, 2], torch.full((4,), 1.5, device="meta"), 0.1)
+    assert {t.device.type for t in (total, *terms.values(), z, low)} == {"meta"}
+    assert z.shape == (4, 2 * reference["qpos"].shape[1] - 3)
