@@ -381,6 +381,30 @@ def test_a_flight_keeps_its_height_and_its_pose() -> None:
     assert np.abs(planted.qpos[:, :3] - settled.qpos[:, :3]).max() < 2e-3
 
 
+def test_a_flight_falls_as_gravity_has_it() -> None:
+    """A jump whose parabola is two thirds as high as its time in the air asks for gets the height of g's own."""
+    frames, third = 90, 30
+    fall = 0.125 * 9.81 * ((third + 1) / 30.0) ** 2
+    flat = jump(frames, apex=0.67 * fall)
+    body = flat.qpos[:, :3]
+    plain, _ = settle(flat, sole_positions(HUMANOID, flat), SettleSettings(largest=1.0))
+    held, _ = settle(flat, sole_positions(HUMANOID, flat), SettleSettings(largest=1.0), center_of_mass=body)
+    rise = [float((m.qpos[30:60, 2] - m.qpos[10, 2]).max()) for m in (plain, held)]
+    assert rise[0] == pytest.approx(0.67 * fall, rel=0.05)
+    assert rise[1] > 0.9 * fall
+
+
+def test_a_body_that_does_not_fall_is_put_on_the_floor() -> None:
+    """Feet too quick to count as touching (a run whose root the export flattened), 4 cm up: something carries them."""
+    motion = standing(90)
+    qpos = motion.qpos.copy()
+    qpos[:, 0] += 3.0 * np.arange(90) / 30.0
+    qpos[:, 2] += 0.04 * np.sin(np.arange(90) * 0.2) ** 2
+    floating = replace(motion, qpos=qpos)
+    settled, _ = settle(floating, sole_positions(HUMANOID, floating), center_of_mass=floating.qpos[:, :3])
+    assert np.abs(sole_positions(HUMANOID, settled)[..., 2] + 0.004).max() < 0.01
+
+
 def test_a_slow_drift_of_the_floor_is_taken_out() -> None:
     motion = standing(300)
     qpos = motion.qpos.copy()

@@ -22,6 +22,8 @@ from multiprocessing import get_context  # noqa: E402
 from typing import Any  # noqa: E402
 
 import numpy as np  # noqa: E402
+from numpy.typing import NDArray  # noqa: E402
+from tensordict import TensorDict  # noqa: E402
 
 from egopose.config import compose_config  # noqa: E402
 from egopose.data.feasibility import contact_residual  # noqa: E402
@@ -111,10 +113,8 @@ def open_loop_gate(humanoid: HumanoidModel, clip: Motion, threads: int = 1, *, e
         raise ValueError("the clip has no contacts; make it with reference_motion")
     states = reference_states(humanoid, clip)
     qpos, qvel = states["qpos"].numpy(), states["qvel"].numpy()
-    on_floor = supported(humanoid, states, clip.contacts, clip.fps)
-    feasible = on_floor & (contact_residual(humanoid, clip) < LARGEST_RESIDUAL)
-    good = on_floor if every_start else feasible
-    starts = np.array([s for s in range(0, len(clip) - STEPS - 1, STRIDE) if good[s : s + STEPS + 1].all()], dtype=int)
+    on_floor, feasible = _frames(humanoid, clip, states)
+    starts = _starts(on_floor if every_start else feasible)
     if not len(starts):
         nothing = (float("nan"),) * STEPS
         return GateResult(0, float(on_floor.mean()), float(feasible.mean()), nothing, nothing, nothing)
@@ -125,7 +125,7 @@ def open_loop_gate(humanoid: HumanoidModel, clip: Motion, threads: int = 1, *, e
         frames = starts + k + 1
         physics.step(np.ascontiguousarray(qpos[frames, 7:] + LEAD * qvel[frames, 6:]))
         height[k] = physics.qpos[:, 2] - qpos[frames, 2]
-        reward[k] = _root_reward(physics.qpos, qpos[frames])
+        reward[k] = root_reward(physics.qpos, qpos[frames])
     physics.close()
     return GateResult(
         len(starts),
@@ -137,7 +137,25 @@ def open_loop_gate(humanoid: HumanoidModel, clip: Motion, threads: int = 1, *, e
     )
 
 
-def _root_reward(qpos: Array, reference: Array) -> Array:
+def feasible_starts(humanoid: HumanoidModel, clip: Motion) -> NDArray[np.int64]:
+    """Frames ``[S]`` :func:`open_loop_gate` starts from. Raises ValueError as it does."""
+    if clip.contacts is None:
+        raise ValueError("the clip has no contacts; make it with reference_motion")
+    return _starts(_frames(humanoid, clip, reference_states(humanoid, clip))[1])
+
+
+def _frames(humanoid: HumanoidModel, clip: Motion, states: TensorDict) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """Frames ``[T]`` on the floor or in flight, and those among them that contact can have made."""
+    assert clip.contacts is not None
+    on_floor = supported(humanoid, states, clip.contacts, clip.fps)
+    return on_floor, on_floor & (contact_residual(humanoid, clip) < LARGEST_RESIDUAL)
+
+
+def _starts(good: NDArray[np.bool_]) -> NDArray[np.int64]:
+    return np.array([s for s in range(0, len(good) - STEPS - 1, STRIDE) if good[s : s + STEPS + 1].all()], dtype=int)
+
+
+def root_reward(qpos: Array, reference: Array) -> Array:
     """r_p ``[N]`` of ``qpos [N, nq]``."""
     off = rot.to_rotvec(rot.multiply(rot.conjugate(reference[:, 3:7]), qpos[:, 3:7]))
     return np.exp(-300.0 * (qpos[:, 2] - reference[:, 2]) ** 2 - 75.0 * np.sum(off**2, axis=1))

@@ -80,7 +80,7 @@ def settle(
     touching = contact_labels(points, motion.fps, height=settings.contact_height, speed=settings.contact_speed)
     edges = (points if sole_edges is None else sole_edges - (sole_points - points)[:, :1])[..., 2].min(axis=1)
     com_height = None if center_of_mass is None else center_of_mass[:, 2] - floor
-    shift = _contact_shift(edges, touching.any(axis=1), com_height, motion.fps, settings)
+    shift = _contact_shift(edges, np.asarray(touching.any(axis=1)), com_height, motion.fps, settings)
     shift = shift - floor - settings.depth
     qpos = motion.qpos.copy()
     qpos[:, 2] += shift
