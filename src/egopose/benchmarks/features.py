@@ -53,7 +53,7 @@ def run(overrides: Sequence[str], rounds: int) -> dict[str, Any]:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "pan.mp4"
         write_pan(path, size, _FRAMES, float(vision["video"]["fps"]))
-        encode(encoder, extract_flow(path, flow_config, count=batch), batch)
+        encode(encoder, extract_flow(path, flow_config, count=min(batch, _FRAMES)), batch)
         for _ in range(rounds):
             decoding, frames = _timed(lambda: _decode(path))
             flowing, flow = _timed(lambda: extract_flow(path, flow_config))

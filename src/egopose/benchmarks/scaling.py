@@ -1,8 +1,13 @@
-"""What each part of an iteration costs on this machine, for the model of many cores in ``experiments/scaling``."""
+"""What each part of an iteration costs on this machine, for the model of many cores in ``experiments/scaling``.
+
+Parts that one thread computes are timed by the processor's clock, which others' work on the machine hardly moves; what
+several processes do together by the wall's, of which the quickest round counts.
+"""
 
 from __future__ import annotations
 
 import io
+import os
 import pickle
 import statistics
 import tempfile
@@ -32,7 +37,7 @@ def run(overrides: Sequence[str], rounds: int) -> dict[str, Any]:
 
     Args:
         overrides: of the training configuration (``sim=paper algo.epochs=10``).
-        rounds: of whole iterations; the median counts.
+        rounds: of whole iterations; the quickest counts.
 
     Returns:
         ``physics_s`` a world and control step, one thread, with its spread ``physics_cv`` over batched steps of 32
@@ -40,13 +45,14 @@ def run(overrides: Sequence[str], rounds: int) -> dict[str, Any]:
         resets, transforms, TorchRL; ``policy_fixed_s``, ``policy_world_s`` likewise; ``join_s`` a frame: the pieces of
         workers of this machine made one batch; ``pack_s``, ``unpack_s`` and ``frame_bytes`` a frame: between machines;
         ``weights_s`` and ``exchange_s`` a worker and iteration, ``weights_bytes``, ``exchange_bytes``;
-        ``gae_s`` a row, ``update_s`` a row and epoch, on ``update_threads`` threads; ``epochs``, ``minibatch_size``,
+        ``gae_s`` a row, ``update_s`` a row and epoch, on one thread; ``epochs``, ``minibatch_size``,
         ``steps_per_iteration``, ``worlds`` (of a worker), ``substeps``.
         ``measured_sync_1``, ``measured_multi_sync_2`` ...: control steps/s of whole iterations, with the kind and the
-        workers. ``workers_mb_N``: memory of N workers together (PSS), ``worker_private_mb_N``: what each holds for
-        itself; ``features_mb``: a memory-mapped table all of whose rows each worker reads, ``features_copied_mb_N``:
-        the most that one worker holds of it for itself; ``problem_frame_bytes``: what each environment holds for
-        itself of every frame of reference motion.
+        workers; ``worked_sync_1`` ...: those that the processor time of the same iterations (the busiest worker's and
+        the learner's) allows where no one else uses the machine. ``workers_mb_N``: memory of N workers together (PSS);
+        ``worker_private_mb_N``: what each holds for itself; ``features_mb``: a memory-mapped table all of whose rows
+        each worker reads; ``features_copied_mb_N``: the most that one worker holds of it for itself;
+        ``problem_frame_bytes``: what each environment holds for itself of every frame of reference motion.
 
     Raises:
         InputError: a setting is unknown or out of range.
@@ -55,7 +61,7 @@ def run(overrides: Sequence[str], rounds: int) -> dict[str, Any]:
     from egopose.training.collectors import CollectorSettings, set_threads
     from egopose.training.ppo import PPO, PPOSettings
 
-    config = pipeline.compose_config("train", ["collector=multi_sync", *overrides])
+    config = pipeline.compose_config("train", ["collector=multi_sync", "collector.update_threads=1", *overrides])
     material = pipeline.motion_material(config)
     settings = CollectorSettings.from_config(config["collector"])
     algo = config["algo"]
@@ -67,7 +73,6 @@ def run(overrides: Sequence[str], rounds: int) -> dict[str, Any]:
         "epochs": int(algo["epochs"]),
         "minibatch_size": algo["minibatch_size"],
         "steps_per_iteration": int(algo["steps_per_iteration"]),
-        "update_threads": settings.update_threads,
     }
     env = make_env(settings.worlds, 0)
     torch.manual_seed(0)
@@ -78,7 +83,7 @@ def run(overrides: Sequence[str], rounds: int) -> dict[str, Any]:
     ppo = PPO(actor, critic, PPOSettings.from_config(algo))
     batch = _batch(make_env, actor, int(algo["steps_per_iteration"]), settings.worlds)
     out |= _transfer(batch)
-    out |= _learning(ppo, batch, settings, rounds)
+    out |= _learning(ppo, batch, rounds)
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "features.memmap"
         width = material.visual_context.shape[1]  # type: ignore[union-attr]
@@ -90,7 +95,7 @@ def run(overrides: Sequence[str], rounds: int) -> dict[str, Any]:
     for kind in ("sync", "multi_async"):
         workers = 1 if kind == "sync" else 2
         chosen = replace(settings, kind=kind, workers=workers, physics_threads=1)
-        out[f"measured_{kind}_{workers}"] = _whole_iterations(chosen, make_env, ppo, out, rounds)
+        out |= _whole_iterations(f"{kind}_{workers}", chosen, make_env, ppo, out, rounds)
     return out
 
 
@@ -104,18 +109,35 @@ def _make_env(config: Mapping[str, Any], material: Any, worlds: int, number: int
 
 def _own_frame_bytes(problem: Any) -> float:
     """Bytes a frame of the tables that a problem has made for itself."""
-    tables = [*vars(problem).values(), *getattr(problem, "_rewarded", {}).values()]
+    held = vars(problem).values()
+    tables = [table for one in held for table in (one.values() if isinstance(one, dict) else [one])]
     own = [t for t in tables if isinstance(t, torch.Tensor) and not isinstance(t, MemoryMappedTensor)]
     return float(sum(t[0].numel() * t.element_size() for t in own if t.ndim and len(t) == problem.n_frames))
 
 
-def _median_s(act: Callable[[], Any], repeats: int) -> float:
+def _worked_s(pid: int) -> float:
+    """Seconds of processor time that a process has used."""
+    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+
+def _cpu_s(act: Callable[[], Any], repeats: int) -> float:
+    """Median seconds of this process's processor time."""
+    return statistics.median(_times(act, repeats, time.process_time))
+
+
+def _quickest_s(act: Callable[[], Any], repeats: int) -> float:
+    """Shortest seconds by the wall's clock."""
+    return min(_times(act, repeats, time.perf_counter))
+
+
+def _times(act: Callable[[], Any], repeats: int, clock: Callable[[], float]) -> list[float]:
     times = []
     for _ in range(repeats):
-        start = time.perf_counter()
+        start = clock()
         act()
-        times.append(time.perf_counter() - start)
-    return statistics.median(times)
+        times.append(clock() - start)
+    return times
 
 
 def _collection(make_env: Callable[[int, int], EnvBase], actor: Any) -> dict[str, float]:
@@ -131,19 +153,19 @@ def _collection(make_env: Callable[[int, int], EnvBase], actor: Any) -> dict[str
         take = engine.step
 
         def timed(ctrl: Any, take: Any = take, steps: list[float] = steps) -> Any:
-            start = time.perf_counter()
+            start = time.process_time()
             result = take(ctrl)
-            steps.append(time.perf_counter() - start)
+            steps.append(time.process_time() - start)
             return result
 
         engine.step = timed
         batches = iter(collector)
         batch = next(batches)
         steps.clear()
-        whole = _median_s(lambda batches=batches: next(batches), 3) / _STEPS  # type: ignore[misc]
+        whole = _cpu_s(lambda batches=batches: next(batches), 3) / _STEPS  # type: ignore[misc]
         seen = batch[:, 0].select(*actor.in_keys)
         with torch.no_grad():
-            policy[worlds] = _median_s(lambda seen=seen: actor(seen.copy()), _REPEATS)  # type: ignore[misc]
+            policy[worlds] = _cpu_s(lambda seen=seen: actor(seen.copy()), _REPEATS)  # type: ignore[misc]
         physics[worlds] = np.array(steps)
         python[worlds] = whole - float(physics[worlds].mean()) - policy[worlds]
         collector.shutdown()
@@ -185,21 +207,17 @@ def _transfer(batch: TensorDictBase) -> dict[str, float]:
     data = packed.getvalue()
     frames = batch.numel()
     return {
-        "join_s": _median_s(lambda: torch.cat(halves), _REPEATS) / frames,
-        "pack_s": _median_s(lambda: pickle.dumps(batch, protocol=5), 5) / frames,
-        "unpack_s": _median_s(lambda: pickle.loads(data), 5) / frames,
+        "join_s": _cpu_s(lambda: torch.cat(halves), _REPEATS) / frames,
+        "pack_s": _cpu_s(lambda: pickle.dumps(batch, protocol=5), 5) / frames,
+        "unpack_s": _cpu_s(lambda: pickle.loads(data), 5) / frames,
         "frame_bytes": len(data) / frames,
     }
 
 
-def _learning(ppo: Any, batch: TensorDictBase, settings: Any, rounds: int) -> dict[str, float]:
-    from egopose.training.collectors import set_threads
-
-    set_threads(settings.update_threads)
+def _learning(ppo: Any, batch: TensorDictBase, rounds: int) -> dict[str, float]:
     rows = ppo.advantages(batch.clone())
-    gae = _median_s(lambda: ppo.advantages(batch.clone()), rounds) - _median_s(batch.clone, rounds)
-    update = _median_s(lambda: ppo.update(rows), rounds)
-    set_threads(settings.threads)
+    gae = _cpu_s(lambda: ppo.advantages(batch.clone()), rounds) - _cpu_s(batch.clone, rounds)
+    update = _cpu_s(lambda: ppo.update(rows), rounds)
     return {"gae_s": gae / len(rows), "update_s": update / len(rows) / ppo.settings.epochs}
 
 
@@ -223,19 +241,21 @@ def _workers(
             f"features_copied_mb_{count}": max(altered for _, altered in copied),
         }
         if count == 2:
-            out["weights_s"] = _median_s(pool.update_policy_weights_, _REPEATS) / count
-            out["exchange_s"] = _median_s(pool._exchange_all, _REPEATS) / count
+            out["weights_s"] = _quickest_s(pool.update_policy_weights_, _REPEATS) / count
+            out["exchange_s"] = _quickest_s(pool._exchange_all, _REPEATS) / count
             out["weights_bytes"] = float(sum(p.numel() * p.element_size() for p in ppo.actor.parameters()))
             state = (pool.transforms, pool.simulation[0])
             out["exchange_bytes"] = float(len(pickle.dumps(state, protocol=5)))
         if count <= 2:
-            out[f"measured_multi_sync_{count}"] = _rate(pool, batches, ppo, settings, rounds)
+            out |= _rate(f"multi_sync_{count}", pool, batches, ppo, settings, rounds)
         return out
     finally:
         pool.shutdown()
 
 
-def _whole_iterations(settings: Any, make_env: Any, ppo: Any, known: Mapping[str, Any], rounds: int) -> float:
+def _whole_iterations(
+    name: str, settings: Any, make_env: Any, ppo: Any, known: Mapping[str, Any], rounds: int
+) -> dict[str, float]:
     from egopose.training.collectors import build_collector
 
     steps = int(known["steps_per_iteration"])
@@ -243,23 +263,35 @@ def _whole_iterations(settings: Any, make_env: Any, ppo: Any, known: Mapping[str
     try:
         batches = iter(collector)
         next(batches)
-        return _rate(collector, batches, ppo, settings, rounds)
+        return _rate(name, collector, batches, ppo, settings, rounds)
     finally:
         collector.shutdown()
 
 
-def _rate(collector: Any, batches: Any, ppo: Any, settings: Any, rounds: int) -> float:
-    """Control steps/s of iterations as training takes them."""
+def _rate(name: str, collector: Any, batches: Any, ppo: Any, settings: Any, rounds: int) -> dict[str, float]:
+    """Control steps/s of iterations as training takes them; ``name`` is the kind and the workers."""
     from egopose.training.collectors import set_threads
 
-    rates = []
-    for _ in range(rounds):
-        start = time.perf_counter()
+    pids = [process.pid for process in getattr(getattr(collector, "_collector", None), "procs", ())]
+    frames = 0
+
+    def iterate() -> None:
+        nonlocal frames
         set_threads(settings.threads)
         batch = next(batches)
         set_threads(settings.update_threads)
         ppo.update(ppo.advantages(batch))
         collector.update_policy_weights_()
-        rates.append(batch.numel() / (time.perf_counter() - start))
+        frames = batch.numel()
+
+    begun, here = [_worked_s(pid) for pid in pids], time.process_time()
+    seconds = _quickest_s(iterate, rounds)
+    learner = (time.process_time() - here) / rounds
+    workers = [(_worked_s(pid) - start) / rounds for pid, start in zip(pids, begun, strict=True)]
     set_threads(settings.threads)
-    return statistics.median(rates)
+    if settings.kind == "multi_async":
+        # As many cores as workers, which learner and workers share.
+        needed = max(learner, (sum(workers) + learner) / len(workers))
+    else:
+        needed = max(workers, default=0.0) + learner
+    return {f"measured_{name}": frames / seconds, f"worked_{name}": frames / needed}
