@@ -382,7 +382,7 @@ def test_a_flight_keeps_its_height_and_its_pose() -> None:
 
 
 def test_a_flight_falls_as_gravity_has_it() -> None:
-    """A jump whose parabola is two thirds as high as its time in the air asks for comes nearer to the height of g's own."""
+    """A jump two thirds as high as its time in the air asks for comes nearer to the height of g's own."""
     frames, third = 90, 30
     fall = 0.125 * 9.81 * ((third + 1) / 30.0) ** 2
     flat = jump(frames, apex=0.67 * fall)
