@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import copy
 import random
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -22,6 +22,8 @@ from egopose.config import compose_config
 from egopose.data.preparation import store_folder
 from egopose.data.store import TakeStore
 from egopose.envs import build as envs
+from egopose.envs.forecasting import RecurrentStates, TimeLeft
+from egopose.envs.starts import FragmentLike
 from egopose.envs.transformed import TransformedEgoPoseEnv
 from egopose.envs.transforms import StateNormalizer, TrackingError, VisualContext
 from egopose.errors import InputError
@@ -29,6 +31,7 @@ from egopose.evaluation.report import TakeVideo
 from egopose.evaluation.survival import frames_survived
 from egopose.material import Material, load_material, motion_material, run_material
 from egopose.models.policy import PolicySettings, build_actor, build_critic
+from egopose.models.recurrent import collecting_policy, hidden_keys
 from egopose.training.checkpoint import RunCheckpoint, find_checkpoint, read_json, require, verify
 from egopose.training.collectors import CollectorSettings, build_collector, transform_state
 from egopose.training.loop import Evaluation, LoopSettings, Run, interrupts_held
@@ -64,6 +67,7 @@ def build_env(
     whole_fragments: bool = False,
     falls_end: bool | None = None,
     dump_dir: Path | None = None,
+    fragments: Sequence[FragmentLike] | None = None,
 ) -> TransformedEnv:
     """The environment with its transforms, as ``config`` says.
 
@@ -77,11 +81,16 @@ def build_env(
         whole_fragments: each world runs its own fragment from end to end.
         falls_end: whether a fall ends an episode; None for what the task says.
         dump_dir: where diverged worlds leave their last states.
+        fragments: in place of those of ``split``.
 
     Raises:
-        InputError: the configuration asks for a table the material lacks, or the rooms refuse it.
+        InputError: the configuration asks for a table the material lacks, lets a forecast see the future, or the rooms
+            refuse it.
     """
     task = dict(config["task"])
+    forecasts = task.get("context") is not None
+    if forecasts:
+        _refuse_future(config)
     if falls_end is not None:
         task["termination"] = {**task["termination"], "enabled": falls_end}
     try:
@@ -95,7 +104,7 @@ def build_env(
         )
         base = envs.build_env(
             problem,
-            material.train if split == "train" else material.test,
+            fragments or (material.train if split == "train" else material.test),
             worlds,
             task,
             threads=threads,
@@ -118,7 +127,25 @@ def build_env(
         scale = _state_scale(material, float(config["regressor"]["std_floor"]))
         clip = float(task["tracking_error_clip"])
         transforms.insert(0, TrackingError(material.states, material.takes.following(), scale, clip))
+    if forecasts:
+        transforms.append(TimeLeft(int(task["horizon"]) - 1))
+    if (memory := config["model"].get("memory")) is not None:
+        keys = [key for owner in ("policy", "value") for key in hidden_keys(owner)]
+        transforms.append(RecurrentStates(dict.fromkeys(keys, int(memory["hidden_size"]))))
     return TransformedEgoPoseEnv(base, *transforms)
+
+
+def _refuse_future(config: Mapping[str, Any]) -> None:
+    """Raises InputError: a forecasting policy would read what is known only once the future was seen."""
+    task, model = config["task"], config["model"]
+    if task["action"]["reference"] == "regressor":
+        raise InputError("configuration", "task.action.reference", "regressor knows the frames to be forecast")
+    if "tracking_error" in model["inputs"]:
+        raise InputError("configuration", "model.inputs", "tracking_error knows the frames to be forecast")
+    context = model["context"]
+    if context["source"] != "past" or int(context["horizon"]) > int(task["context"]):
+        cause = f"a forecast sees the past {task['context']} frames only: model=forecasting"
+        raise InputError("configuration", "model.context", cause)
 
 
 def _state_scale(material: Material, floor: float) -> torch.Tensor:
@@ -170,7 +197,7 @@ def build_run(config: Mapping[str, Any], folder: Path, material: Material) -> Ru
         collector = build_collector(
             collector_settings,
             partial(_training_env, config, material, collector_settings, folder),
-            actor,
+            collecting_policy(actor, critic),
             settings.steps_per_iteration,
         )
     ppo = PPO(actor, critic, ppo_settings)

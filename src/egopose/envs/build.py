@@ -12,7 +12,7 @@ from torch import Tensor
 from egopose.envs.env import EgoPoseEnv
 from egopose.envs.mdp.rewards import build_reward
 from egopose.envs.problem import ActionSettings, ImitationProblem, TakeTable, TerminationSettings
-from egopose.envs.starts import FragmentLike, Starts, UniformStarts, WholeFragments
+from egopose.envs.starts import FragmentLike, Starts, UniformStarts, WholeFragments, after_context
 
 if TYPE_CHECKING:
     from egopose.humanoid.model import HumanoidModel
@@ -60,7 +60,7 @@ def build_env(
         problem: see :func:`build_problem`.
         fragments: where episodes lie.
         n_worlds: N; with ``whole_fragments`` usually their number.
-        task: ``conf/task``.
+        task: ``conf/task``; with a ``context`` an episode begins at the last frame of that many.
         threads: of the physics.
         seed: of the starts.
         whole_fragments: evaluation: each world runs its own fragment from end to end.
@@ -68,6 +68,8 @@ def build_env(
     """
     offsets, lengths = problem.takes.offsets, problem.takes.lengths
     starts: Starts
+    if task.get("context"):
+        fragments = after_context(fragments, task["context"], 2 if whole_fragments else task["minimum"])
     if whole_fragments:
         starts = WholeFragments(fragments, offsets, lengths)
     else:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import torch
 from torch import Tensor
@@ -19,6 +19,23 @@ class FragmentLike(Protocol):
     def start(self) -> int: ...
     @property
     def stop(self) -> int: ...
+
+
+class Piece(NamedTuple):
+    """The plainest fragment."""
+
+    take: int
+    start: int
+    stop: int
+
+
+def after_context(fragments: Sequence[FragmentLike], context: int, minimum: int = 2) -> list[Piece]:
+    """Where forecasts of each fragment can begin and what follows: from the last of its first ``context`` frames on.
+
+    Pieces of fewer than ``minimum`` frames are left out.
+    """
+    pieces = [Piece(f.take, f.start + context - 1, f.stop) for f in fragments]
+    return [piece for piece in pieces if piece.stop - piece.start >= minimum]
 
 
 @dataclass(frozen=True)

@@ -15,8 +15,8 @@ class TransformedEgoPoseEnv(TransformedEnv):
 
     TorchRL's way is made for any environment: it copies, checks and merges whole batches at every step, and once more
     when a single world is reset. Here a step makes the next state, and a reset the rows of the worlds that are reset.
-    What comes out is the same to the bit, except that what the policy wrote is not carried to the next step. Every
-    other method is TorchRL's.
+    What comes out is the same to the bit, except that of what the policy wrote only that under ``next`` (hidden states)
+    is carried to the next step. Every other method is TorchRL's.
 
     Args:
         env: the environment.
@@ -28,7 +28,10 @@ class TransformedEgoPoseEnv(TransformedEnv):
 
     def step_and_maybe_reset(self, tensordict: TensorDictBase) -> tuple[TensorDictBase, TensorDictBase]:
         """See ``EnvBase.step_and_maybe_reset``: the transition, and what the next step starts from."""
+        written = tensordict.get("next", None)
         after = self.transform._step(tensordict, self.base_env._step(tensordict))
+        if written is not None:
+            after.update(written.exclude(*after.keys(include_nested=True)))
         tensordict.set("next", after)
         done = after["done"]
         follows = after.copy()  # of the nested entries too, but not of the tensors

@@ -56,7 +56,7 @@ class EpisodeContext(nn.Module):
         self.features_table = features_table
         self.take_bounds = bounds
         self.padding, self.horizon, self.lookahead = padding, horizon, lookahead
-        self._cache = _WindowCache(context.output_size)
+        self._cache = WindowCache(context.output_size)
 
     def forward(self, episode_start: Tensor, frame: Tensor) -> Tensor:
         """Args: ``episode_start [..., 1]`` and ``frame [..., 1]`` int64 global frames. Returns: ``[..., D_context]``.
@@ -124,7 +124,7 @@ def parameter_version(module: nn.Module) -> tuple[Hashable, ...]:
     return (*((p.data_ptr(), p._version) for p in parameters), *torch.stack(norms).tolist())
 
 
-class _WindowCache:
+class WindowCache:
     """Contexts of windows end to end in one growing table; ``offset`` says where each episode's begins."""
 
     def __init__(self, width: int) -> None:

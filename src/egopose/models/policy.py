@@ -2,6 +2,7 @@
 
 Both are an MLP (300, 200) on the humanoid's state and the visual context; they share nothing. The context either comes
 with the observation (frozen, from the state regressor) or from a recurrent network of the module's own, trained by PPO.
+Forecasting's have a memory of the states so far in place of the state (section 3.2).
 """
 
 from __future__ import annotations
@@ -20,9 +21,10 @@ from torchrl.modules import MLP, IndependentNormal, ProbabilisticActor, ValueOpe
 
 from egopose.config import from_mapping
 from egopose.errors import InputError
-from egopose.models.context import BidirectionalContext
+from egopose.models.context import BidirectionalContext, ForwardContext
 from egopose.models.episode_context import EpisodeContext, episode_context_module
 from egopose.models.feedback import BalanceFeedback, FeedbackSettings
+from egopose.models.recurrent import PastContext, past_context_module, state_memory
 
 _log = logging.getLogger(__name__)
 
@@ -31,13 +33,21 @@ _ACTIVATIONS: dict[str, type[nn.Module]] = {"relu": nn.ReLU, "tanh": nn.Tanh, "e
 
 @dataclass(frozen=True)
 class ContextSettings:
-    """``source``: ``frozen`` (``visual_context`` is in the observation) or ``trainable`` (own BiLSTM); the window's
-    frames and the units a direction are read only by ``trainable``."""
+    """``source``: ``frozen`` (``visual_context`` is in the observation), ``trainable`` (own BiLSTM over the episode) or
+    ``past`` (own LSTM over the ``horizon`` frames up to the episode's first); units and frames are not read by
+    ``frozen``, ``padding`` by ``trainable`` only."""
 
     source: str
     hidden_size: int
     horizon: int
     padding: int
+
+
+@dataclass(frozen=True)
+class MemorySettings:
+    """Units of the LSTM over the states so far, one in the actor and one in the critic."""
+
+    hidden_size: int
 
 
 @dataclass(frozen=True)
@@ -62,6 +72,7 @@ class PolicySettings:
         inputs: further observation keys actor and critic read, such as ``tracking_error``.
         context: see :class:`ContextSettings`.
         critic: see :class:`CriticSettings`.
+        memory: see :class:`MemorySettings`, or None to read the state itself.
     """
 
     hidden: tuple[int, ...]
@@ -73,18 +84,26 @@ class PolicySettings:
     feedback: FeedbackSettings | None
     context: ContextSettings
     critic: CriticSettings
+    memory: MemorySettings | None = None
 
     @classmethod
     def from_config(cls, config: Mapping[str, Any]) -> PolicySettings:
         """From the resolved config group. Raises InputError naming the setting that is missing, unknown or wrong."""
         parts: dict[str, Any] = {
             name: from_mapping(part, config[name], f"model.{name}")
-            for name, part in (("context", ContextSettings), ("critic", CriticSettings), ("feedback", FeedbackSettings))
+            for name, part in (
+                ("context", ContextSettings),
+                ("critic", CriticSettings),
+                ("feedback", FeedbackSettings),
+                ("memory", MemorySettings),
+            )
             if config.get(name) is not None
         }
         settings = from_mapping(cls, {**config, **parts}, "model")
-        if settings.context.source not in ("frozen", "trainable"):
-            raise InputError("model", "context.source", f"must be frozen or trainable, not {settings.context.source!r}")
+        if settings.context.source not in ("frozen", "trainable", "past"):
+            raise InputError(
+                "model", "context.source", f"must be frozen, trainable or past, not {settings.context.source!r}"
+            )
         if settings.activation not in _ACTIVATIONS:
             raise InputError("model", "activation", f"must be one of {', '.join(_ACTIVATIONS)}")
         if settings.feedback is not None and "tracking_error" not in settings.inputs:
@@ -150,8 +169,8 @@ def build_actor(
         settings: of the policy.
         widths: last dimension of each observation key (``humanoid_state``; ``visual_context`` where it is frozen).
         action_size: degrees of freedom driven.
-        features_table: ``[F, D]`` visual features, only where the context is trainable.
-        take_bounds: ``[K, 2]`` int64 global frames of the takes, only where the context is trainable.
+        features_table: ``[F, D]`` visual features, only where the context is not frozen.
+        take_bounds: ``[K, 2]`` int64 global frames of the takes, only where the context is not frozen.
         state_key: observation that holds the humanoid's state.
         dof_names: of the actions, in order; read only where the settings have a feedback.
 
@@ -159,13 +178,14 @@ def build_actor(
         InputError: an observation or a hinge the settings need is not there.
     """
     context, context_key, context_width = _context(settings, widths, "visual_context", features_table, take_bounds)
-    width = _width(widths, state_key, "humanoid_state") + context_width
-    width += sum(_width(widths, key, "inputs") for key in settings.inputs)
+    memory, state_key, state_width = _memory(settings, widths, state_key, "policy")
+    width = state_width + context_width + sum(_width(widths, key, "inputs") for key in settings.inputs)
     in_keys = [state_key, context_key, *settings.inputs]
     feedback = None if settings.feedback is None else BalanceFeedback(settings.feedback, dof_names)
     at = in_keys.index("tracking_error") if feedback is not None else 0
     head = GaussianHead(width, action_size, settings, feedback, at)
-    module = TensorDictSequential(*context, TensorDictModule(head, in_keys=in_keys, out_keys=["loc", "scale"]))
+    gaussian = TensorDictModule(head, in_keys=in_keys, out_keys=["loc", "scale"])
+    module = TensorDictSequential(*context, *memory, gaussian)
     actor = ProbabilisticActor(
         module,
         in_keys=["loc", "scale"],
@@ -191,12 +211,13 @@ def build_critic(
     context, context_key, context_width = _context(
         settings, widths, "critic_visual_context", features_table, take_bounds
     )
+    memory, state_key, state_width = _memory(settings, widths, state_key, "value")
     privileged = (*settings.inputs, *settings.critic.privileged)
     in_keys = [state_key, context_key, *privileged]
-    width = _width(widths, state_key, "humanoid_state") + context_width
+    width = state_width + context_width
     width += sum(_width(widths, key, "critic.privileged") for key in privileged)
     value = ValueOperator(_mlp(width, 1, settings.critic.hidden, settings.activation), in_keys=in_keys)
-    critic = TensorDictSequential(*context, value)
+    critic = TensorDictSequential(*context, *memory, value)
     log_parameter_count("critic", critic)
     return critic
 
@@ -212,10 +233,27 @@ def _context(
     if settings.context.source == "frozen":
         return [], "visual_context", _width(widths, "visual_context", "context.source")
     if features_table is None or take_bounds is None:
-        raise InputError("model", "context.source", "trainable needs the store's visual features and take bounds")
+        cause = f"{settings.context.source} needs the store's visual features and take bounds"
+        raise InputError("model", "context.source", cause)
+    if settings.context.source == "past":
+        past = ForwardContext(features_table.shape[1], settings.context.hidden_size)
+        seen = PastContext(features_table, past, take_bounds, settings.context.horizon)
+        return [past_context_module(seen, out_key)], out_key, past.output_size
     network = BidirectionalContext(features_table.shape[1], settings.context.hidden_size)
     window = EpisodeContext(features_table, network, take_bounds, settings.context.padding, settings.context.horizon)
     return [episode_context_module(window, out_key)], out_key, network.output_size
+
+
+def _memory(
+    settings: PolicySettings, widths: Mapping[str, int], state_key: str, owner: str
+) -> tuple[list[TensorDictModule], str, int]:
+    """Modules that make the memory of the states so far (none where there is none), what is read for the state, and
+    its width."""
+    width = _width(widths, state_key, "humanoid_state")
+    if settings.memory is None:
+        return [], state_key, width
+    modules, key = state_memory(owner, state_key, width, settings.memory.hidden_size)
+    return modules, key, settings.memory.hidden_size
 
 
 def _width(widths: Mapping[str, int], key: str, setting: str) -> int:

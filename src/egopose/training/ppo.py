@@ -2,6 +2,7 @@
 
 A batch is what a collector yields: TensorDict ``[N, T]``, worlds by steps, time last. ``terminated`` (a fall)
 bootstraps nothing, ``truncated`` (the time limit) bootstraps from the critic's value of the state it was cut at.
+Networks with a memory learn from whole sequences ``[T]``, each begun with the hidden state it was collected with.
 """
 
 from __future__ import annotations
@@ -14,11 +15,13 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule
 from torch import Tensor
+from torchrl.modules import set_recurrent_mode
 from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
 
 from egopose.config import from_mapping
 from egopose.errors import InputError
+from egopose.models.recurrent import is_recurrent
 
 
 class TrainingDiverged(RuntimeError):
@@ -35,7 +38,8 @@ class PPOSettings:
         clip_epsilon: the ratio's clip.
         entropy_coeff: weight of the entropy bonus; 0 for none.
         epochs: passes over a batch.
-        minibatch_size: rows a gradient step; None for the full batch.
+        minibatch_size: steps in the environment a gradient step learns from; None for the full batch. Networks with a
+            memory take as many whole sequences as that makes, at least one.
         policy_lr: Adam's step size for the actor.
         value_lr: Adam's step size for the critic.
         policy_grad_norm: the actor's gradient is scaled down to this norm.
@@ -100,6 +104,7 @@ class PPO:
         self, actor: ProbabilisticTensorDictSequential, critic: TensorDictModule, settings: PPOSettings
     ) -> None:
         self.actor, self.critic, self.settings = actor, critic, settings
+        self.recurrent = is_recurrent(actor) or is_recurrent(critic)
         self.loss = ClipPPOLoss(
             actor,
             critic,
@@ -122,7 +127,9 @@ class PPO:
 
     @torch.no_grad()
     def advantages(self, batch: TensorDictBase) -> TensorDictBase:
-        """Rows for the update: ``[N * T]`` with what the losses read, ``advantage`` and ``value_target`` among it.
+        """Rows for the update with what the losses read, ``advantage`` and ``value_target`` among it.
+
+        They are ``[N * T]``, or sequences ``[N, T]`` where a network has a memory.
 
         Args:
             batch: ``[N, T]`` as collected.
@@ -130,7 +137,8 @@ class PPO:
         self._values(batch)
         self.gae(batch)
         names = [*self.loss.in_keys, *self.actor.out_keys, "state_value", "advantage", "value_target"]
-        rows = batch.select(*[n for n in names if _root(n) != "next"], strict=False).reshape(-1)
+        rows = batch.select(*[n for n in names if _root(n) != "next"], strict=False)
+        rows = rows if self.recurrent else rows.reshape(-1)
         advantage = rows["advantage"]
         if self.settings.normalize_advantage:
             rows["advantage"] = (advantage - advantage.mean()) / advantage.std().clamp_min(1e-6)
@@ -143,7 +151,8 @@ class PPO:
         looked at by themselves. (TorchRL's ``shifted=True`` is wrong where a row holds resets, ``shifted=False`` looks
         at every state twice.)
         """
-        value = self.critic(batch.select(*self.critic.in_keys))["state_value"]
+        with set_recurrent_mode(self.recurrent):
+            value = self.critic(batch.select(*self.critic.in_keys))["state_value"]
         ends = batch["next", "done"].squeeze(-1).clone()
         ends[:, -1] = True
         after = value.roll(-1, dims=1)
@@ -151,7 +160,7 @@ class PPO:
         batch["state_value"], batch["next", "state_value"] = value, after
 
     def update(self, rows: TensorDictBase) -> dict[str, float]:
-        """All epochs over ``rows [B]``; returns the iteration's figures.
+        """All epochs over the rows of :meth:`advantages`; returns the iteration's figures.
 
         Raises:
             TrainingDiverged: more than ``max_nonfinite`` gradient steps in a row had to be skipped.
@@ -160,7 +169,7 @@ class PPO:
         explained = _explained_variance(rows)
         skipped, kl = 0, 0.0
         for epoch in range(self.settings.epochs):
-            minibatches = self._minibatches(len(rows))
+            minibatches = self._minibatches(rows)
             for index in minibatches:
                 figures = self._gradient_step(rows if index is None else rows[index])
                 if figures is None:
@@ -185,7 +194,8 @@ class PPO:
     def divergence(self, rows: TensorDictBase) -> float:
         """Mean KL(policy that collected ``rows`` || policy now), in closed form."""
         old = self.actor.build_dist_from_params(rows)
-        new = self.actor.get_dist(rows.select(*self.actor.in_keys))
+        with set_recurrent_mode(self.recurrent):
+            new = self.actor.get_dist(rows.select(*self.actor.in_keys))
         return float(torch.distributions.kl_divergence(old, new).mean())
 
     def state(self) -> dict[str, Any]:
@@ -197,17 +207,19 @@ class PPO:
             "value_optimizer": self.value_optimizer,
         }
 
-    def _minibatches(self, count: int) -> list[Tensor | None]:
-        size = self.settings.minibatch_size
-        if size is None or size >= count:
+    def _minibatches(self, rows: TensorDictBase) -> list[Tensor | None]:
+        size, count = self.settings.minibatch_size, len(rows)
+        if size is None or size >= rows.numel():
             return [None]
+        size = max(1, size // rows[0].numel())
         parts = torch.randperm(count).split(size)
         # A short rest would be a gradient step of its own, as long as the others and noisier.
         return list(parts if len(parts[-1]) == size else parts[:-1])
 
     def _gradient_step(self, rows: TensorDictBase) -> dict[str, Tensor] | None:
         """One step of critic and actor, or None where loss or gradient was not finite and nothing was stepped."""
-        losses = self.loss(rows)
+        with set_recurrent_mode(self.recurrent):
+            losses = self.loss(rows)
         policy_loss = losses["loss_objective"] + losses.get("loss_entropy", 0.0)
         self.policy_optimizer.zero_grad()
         self.value_optimizer.zero_grad()
