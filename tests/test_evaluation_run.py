@@ -17,7 +17,7 @@ from egopose.data.reference import reference_states
 from egopose.envs.mdp.observations import humanoid_state
 from egopose.envs.problem import TakeTable
 from egopose.errors import InputError
-from egopose.evaluate import output_folder, run_evaluation, summary
+from egopose.evaluate import output_folder, physics_group, run_evaluation, summary
 from egopose.evaluation.report import TakeVideo, file_name
 from egopose.humanoid.config import HumanoidConfig, SimConfig
 from egopose.humanoid.model import build_humanoid
@@ -111,6 +111,13 @@ def test_bad_settings_are_named(agent: pipeline.Agent, tmp_path: Path) -> None:
     odd = {**EVALUATE, "failsafe": {**EVALUATE["failsafe"], "mode": "sometimes"}}
     with pytest.raises(InputError, match="mode"):
         run_evaluation(odd, [agent], ["a", "b"], [None, None], tmp_path)
+
+
+def test_the_physics_to_score_on_is_a_group_by_name() -> None:
+    assert physics_group(None) is None
+    assert [physics_group(name)["sim"]["substeps"] for name in ("paper", "fast")] == [15, 4]
+    with pytest.raises(InputError, match="sim"):
+        physics_group("quantum")
 
 
 def test_results_never_go_into_a_sealed_checkpoint() -> None:

@@ -143,6 +143,17 @@ def output_folder(out: str | None, checkpoint: Path, split: str) -> Path:
     return folder
 
 
+def physics_group(name: str | None) -> dict[str, Any] | None:
+    """The config group ``sim`` of that name, to score on other physics than a run was trained in; None for the run's.
+
+    Raises:
+        InputError: there is no such group.
+    """
+    from egopose.config import compose_config
+
+    return None if name is None else {"sim": compose_config("prepare", [f"sim={name}"])["sim"]}
+
+
 @command("evaluate")
 def main(config: DictConfig) -> None:
     """Hydra's entry."""
@@ -152,7 +163,8 @@ def main(config: DictConfig) -> None:
         values = resolved(config)
         given = values["checkpoint"]
         paths = [str(p) for p in given] if isinstance(given, list) else [str(given)]
-        agents = [load_agent(path, which=str(values["which"])) for path in paths]
+        overrides = physics_group(values["sim"])
+        agents = [load_agent(path, which=str(values["which"]), overrides=overrides) for path in paths]
         names, videos = take_videos(agents[0].config)
         out = output_folder(values["out"], agents[0].path, str(values["split"]))
         print(summary(run_evaluation(values, agents, names, videos, out)), flush=True)

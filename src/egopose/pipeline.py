@@ -51,7 +51,7 @@ __all__ = [
     "take_videos",
 ]
 
-_STORE_GROUPS = {"data", "humanoid", "sim"}
+_STORE_GROUPS = {"data", "humanoid"}
 _LOOP_IN_ALGO = ("iterations", "steps_per_iteration")
 _LOOP_IN_TRAINING = ("total_steps", "max_seconds", "checkpoint_every", "keep_last", "evaluate_every")
 
