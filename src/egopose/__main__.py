@@ -9,6 +9,7 @@ VERBS = {
     "demo": "train a policy on the default data, evaluate it, show a table and a video",
     "prepare": "turn motion files and videos into a store: retarget, render or decode, flow, features",
     "train": "train a policy (Hydra: group=choice key=value, --multirun)",
+    "baseline": "train a method that policies are compared with: ERD, acLSTM, PathPose",
     "evaluate": "score a checkpoint on held-out takes beside PoseReg: tables, CSV, BVH, side-by-side MP4",
     "estimate": "motion from a video alone: BVH and MP4",
     "bench": "measure the environment's and the pipeline's speed",

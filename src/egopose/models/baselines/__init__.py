@@ -1,0 +1,1 @@
+"""Methods of other papers that the project's policies are compared with."""
