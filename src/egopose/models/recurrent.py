@@ -1,7 +1,7 @@
 """What a forecasting policy reads (Yuan & Kitani 2019, section 3.2): a context of the past, a memory of its states.
 
 phi, the context, is the last output of a forward LSTM over the frames seen, fixed for the rollout; nu_t, the memory, is
-the output of a forward LSTM over the states z_1 .. z_t. That one is TorchRL's ``LSTMModule``: step by step while acting,
+the output of a forward LSTM over the states z_1 .. z_t. That one is TorchRL's ``LSTMModule``: step by step in acting,
 its hidden state going from step to step in the TensorDict (:class:`egopose.envs.forecasting.RecurrentStates` begins
 it), and whole sequences ``[N, T]`` at once under ``torchrl.modules.set_recurrent_mode`` while learning.
 """
