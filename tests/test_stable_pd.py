@@ -62,7 +62,7 @@ def stable_pd(humanoid: HumanoidModel, qpos: np.ndarray, qvel: np.ndarray, targe
     return np.array(out)
 
 
-def implicit_pd(humanoid: HumanoidModel, qpos: np.ndarray, qvel: np.ndarray, targets: np.ndarray) -> np.ndarray:
+def own_pd(humanoid: HumanoidModel, qpos: np.ndarray, qvel: np.ndarray, targets: np.ndarray) -> np.ndarray:
     """The same by the model's own actuators."""
     model = humanoid.mj_model
     data = mujoco.MjData(model)
@@ -91,7 +91,7 @@ def test_stays_near_where_a_torque_limit_holds(walk: Motion, start: int) -> None
     targets = walk.qpos[frames, 7:] + 0.06 * qvel[frames, 6:]
     qpos = walk.qpos[start].copy()
     qpos[2] += 5.0
-    native, reference = (track(humanoid, qpos, qvel[start], targets) for track in (implicit_pd, stable_pd))
+    native, reference = (track(humanoid, qpos, qvel[start], targets) for track in (own_pd, stable_pd))
     assert np.abs(native - reference).max() < 0.006
 
 
@@ -106,7 +106,7 @@ def test_tracks_a_walk_as_reference_stable_pd_does(
     targets = walk.qpos[frames, 7:] + 0.06 * qvel[frames, 6:]
     qpos = walk.qpos[start].copy()
     qpos[2] += lift
-    native, reference = (track(humanoid, qpos, qvel[start], targets) for track in (implicit_pd, stable_pd))
+    native, reference = (track(humanoid, qpos, qvel[start], targets) for track in (own_pd, stable_pd))
     distance = np.abs(native - reference)
     assert distance.max() < largest
     assert distance.mean() < mean
@@ -125,5 +125,5 @@ def test_the_extra_damping_is_the_prediction_term(walk: Motion) -> None:
     model = mujoco.MjModel.from_xml_string(humanoid.xml)
     model.actuator_biasprm[:, 2] = -humanoid.kd
     plain = replace(humanoid, mj_model=model)
-    without, reference = implicit_pd(plain, qpos, qvel[0], targets), stable_pd(humanoid, qpos, qvel[0], targets)
+    without, reference = own_pd(plain, qpos, qvel[0], targets), stable_pd(humanoid, qpos, qvel[0], targets)
     assert np.abs(without - reference).max() > 0.002
