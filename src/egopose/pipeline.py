@@ -32,6 +32,7 @@ from egopose.evaluation.survival import frames_survived
 from egopose.material import Material, load_material, motion_material, run_material
 from egopose.models.policy import PolicySettings, build_actor, build_critic
 from egopose.models.recurrent import collecting_policy, hidden_keys
+from egopose.runtime import settle_heap
 from egopose.training.checkpoint import RunCheckpoint, find_checkpoint, read_json, require, verify
 from egopose.training.collectors import CollectorSettings, build_collector, transform_state
 from egopose.training.loop import Evaluation, LoopSettings, Run, interrupts_held
@@ -201,6 +202,7 @@ def build_run(config: Mapping[str, Any], folder: Path, material: Material) -> Ru
             settings.steps_per_iteration,
         )
     ppo = PPO(actor, critic, ppo_settings)
+    settle_heap()
     return Run(ppo, collector, settings, collector_settings, folder, config, action_size)
 
 

@@ -26,6 +26,7 @@ def run(overrides: Sequence[str], rounds: int) -> dict[str, Any]:
     """
     from egopose import pipeline
     from egopose.envs.benchmark import compare_with_raw
+    from egopose.runtime import settle_heap
     from egopose.training.collectors import CollectorSettings, base_env, build_collector, set_threads
 
     config = pipeline.compose_config("train", ["sim=paper", *overrides])
@@ -35,6 +36,7 @@ def run(overrides: Sequence[str], rounds: int) -> dict[str, Any]:
     env = pipeline.build_env(config, material, worlds=settings.worlds, threads=settings.physics_threads)
     actor, _ = pipeline.build_networks(config, material, env)
     collector = build_collector(settings, lambda _: env, actor, settings.worlds * _STEPS_A_ROUND)
+    settle_heap()
     try:
         return compare_with_raw(iter(collector), base_env(env).physics, rounds)
     finally:

@@ -29,6 +29,7 @@ def run(overrides: Sequence[str], rounds: int) -> dict[str, Any]:
     import torch
 
     from egopose import pipeline
+    from egopose.runtime import settle_heap
     from egopose.training.collectors import CollectorSettings, base_env, build_collector, set_threads
     from egopose.training.ppo import PPO, PPOSettings
 
@@ -41,6 +42,7 @@ def run(overrides: Sequence[str], rounds: int) -> dict[str, Any]:
     actor, critic = pipeline.build_networks(config, material, env)
     ppo = PPO(actor, critic, PPOSettings.from_config(config["algo"]))
     collector = build_collector(settings, lambda _: env, actor, int(config["algo"]["steps_per_iteration"]))
+    settle_heap()
     batches = iter(collector)
 
     def iterate() -> tuple[float, float, float, int]:
