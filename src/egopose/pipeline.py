@@ -23,9 +23,10 @@ from egopose.data.preparation import store_folder
 from egopose.data.store import TakeStore
 from egopose.envs import build as envs
 from egopose.envs.forecasting import RecurrentStates, TimeLeft
+from egopose.envs.mdp.observations import humanoid_state
 from egopose.envs.starts import FragmentLike
 from egopose.envs.transformed import TransformedEgoPoseEnv
-from egopose.envs.transforms import StateNormalizer, TrackingError, VisualContext
+from egopose.envs.transforms import RawState, StateNormalizer, TrackingError, VisualContext
 from egopose.errors import InputError
 from egopose.evaluation.report import TakeVideo
 from egopose.evaluation.survival import frames_survived
@@ -33,6 +34,7 @@ from egopose.material import Material, load_material, motion_material, run_mater
 from egopose.models.policy import PolicySettings, build_actor, build_critic
 from egopose.models.recurrent import collecting_policy, hidden_keys
 from egopose.runtime import settle_heap
+from egopose.training.adversarial import AdversarialPPO, DiscriminatorSettings
 from egopose.training.checkpoint import RunCheckpoint, find_checkpoint, read_json, require, verify
 from egopose.training.collectors import CollectorSettings, build_collector, transform_state
 from egopose.training.loop import Evaluation, LoopSettings, Run, interrupts_held
@@ -128,6 +130,8 @@ def build_env(
         scale = _state_scale(material, float(config["regressor"]["std_floor"]))
         clip = float(task["tracking_error_clip"])
         transforms.insert(0, TrackingError(material.states, material.takes.following(), scale, clip))
+    if "discriminator" in config["algo"]:
+        transforms.insert(0, RawState())
     if forecasts:
         transforms.append(TimeLeft(int(task["horizon"]) - 1))
     if (memory := config["model"].get("memory")) is not None:
@@ -201,9 +205,30 @@ def build_run(config: Mapping[str, Any], folder: Path, material: Material) -> Ru
             collecting_policy(actor, critic),
             settings.steps_per_iteration,
         )
-    ppo = PPO(actor, critic, ppo_settings)
+    if "discriminator" in algo:
+        ppo: PPO = _adversarial(config, material, actor, critic, ppo_settings)
+    else:
+        ppo = PPO(actor, critic, ppo_settings)
     settle_heap()
     return Run(ppo, collector, settings, collector_settings, folder, config, action_size)
+
+
+def _adversarial(
+    config: Mapping[str, Any],
+    material: Material,
+    actor: TensorDictModuleBase,
+    critic: TensorDictModuleBase,
+    settings: PPOSettings,
+) -> AdversarialPPO:
+    """VGAIL's learner: the discriminator's examples are the reference's states on the training frames."""
+    if material.visual_context is None or config["model"]["context"]["source"] != "frozen":
+        raise InputError("configuration", "model.context.source", "a discriminator needs frozen visual context")
+    offsets = material.takes.offsets
+    frames = torch.cat([torch.arange(f.start, f.stop) + offsets[f.take] for f in material.train])
+    states = humanoid_state(material.reference[frames]).float()
+    discriminator = DiscriminatorSettings.from_config(config["algo"]["discriminator"])
+    contexts, floor = torch.as_tensor(material.visual_context[frames]), float(config["regressor"]["std_floor"])
+    return AdversarialPPO(actor, critic, settings, discriminator, states, contexts, floor)
 
 
 def _training_env(

@@ -13,6 +13,7 @@ from torch import Tensor
 from egopose.envs.mdp import terminations
 from egopose.envs.mdp.observations import BodyLayout, BodyState, BodyView
 from egopose.envs.mdp.rewards import Reward
+from egopose.humanoid.torques import torque_driven
 
 if TYPE_CHECKING:
     from egopose.humanoid.model import HumanoidModel
@@ -50,15 +51,22 @@ class ActionSettings:
         scale: of the action, rad per unit.
         velocity_feedforward: with ``regressor``, kd/kp times the table's joint velocity times this is added to the
             target, against the lag of a PD controller.
+        kind: ``pd``: actions move the targets of PD controllers; ``torque``: they are torques, a unit being the joint's
+            limit times ``scale``, and the other settings are not read.
+        joint_damping: with ``torque``, see :func:`egopose.humanoid.torques.torque_driven`.
     """
 
     reference: str = "rest"
     scale: float = 1.0
     velocity_feedforward: float = 0.0
+    kind: str = "pd"
+    joint_damping: float = 0.0
 
     def __post_init__(self) -> None:
         if self.reference not in ("rest", "regressor"):
             raise ValueError(f"action.reference must be rest or regressor, not {self.reference!r}")
+        if self.kind not in ("pd", "torque"):
+            raise ValueError(f"action.kind must be pd or torque, not {self.kind!r}")
 
 
 @dataclass(frozen=True)
@@ -99,6 +107,8 @@ class ImitationProblem:
         termination: TerminationSettings,
         action_reference: Tensor | None = None,
     ) -> None:
+        if action.kind == "torque":
+            humanoid = torque_driven(humanoid, action.joint_damping)
         model = humanoid.mj_model
         if reference["qpos"].shape[1:] != (model.nq,) or reference["qvel"].shape[1:] != (model.nv,):
             raise ValueError(
@@ -123,6 +133,7 @@ class ImitationProblem:
         self._qpos, self._qvel = whole.qpos, whole.qvel
         self._rewarded = {name: getattr(whole, name).contiguous() for name in reward.reads}
         self._range = torch.as_tensor(humanoid.joint_range, dtype=torch.float64).T
+        self._torque_limit = torch.as_tensor(humanoid.torque_limit, dtype=torch.float64)
         self._rest = torch.as_tensor(humanoid.rest_action, dtype=torch.float64)
         self._table: Tensor | None = None
         if action.reference == "regressor":
@@ -131,9 +142,13 @@ class ImitationProblem:
                 raise ValueError(
                     f"action.reference=regressor needs joint targets [{self.n_frames}, {model.nu}], got {got}"
                 )
-            lag = torch.as_tensor(humanoid.kd / humanoid.kp) * action.velocity_feedforward
-            table = torch.as_tensor(action_reference).to(torch.float64)
-            self._table = table + lag * self._table_velocity(table)
+            self.read_actions_from(action_reference)
+
+    def read_actions_from(self, action_reference: Tensor) -> None:
+        """Take ``[F, nu]`` rad for the joint angles that actions are added to. A live stream knows two at a time."""
+        lag = torch.as_tensor(self.humanoid.kd / self.humanoid.kp) * self.action.velocity_feedforward
+        table = torch.as_tensor(action_reference).to(torch.float64)
+        self._table = table + lag * self._table_velocity(table)
 
     def _table_velocity(self, table: Tensor) -> Tensor:
         """``[F, nu]`` rad/s by which each frame is reached from the one before, within its take."""
@@ -158,7 +173,12 @@ class ImitationProblem:
         return state if isinstance(state, BodyView) else BodyView(state, self.layout)
 
     def target(self, action: Tensor, frame: Tensor) -> Tensor:
-        """PD targets ``[N, nu]`` rad from actions ``[N, nu]``, for reaching frames ``[N]``; within joint range."""
+        """PD targets ``[N, nu]`` rad from actions ``[N, nu]``, for reaching frames ``[N]``; within joint range.
+
+        With ``action.kind`` ``torque``: torques ``[N, nu]`` N m, within their limits.
+        """
+        if self.action.kind == "torque":
+            return torch.clamp(self.action.scale * action.to(torch.float64), -1.0, 1.0) * self._torque_limit
         base = self._rest if self._table is None else self._table[frame]
         return torch.clamp(base + self.action.scale * action.to(torch.float64), self._range[0], self._range[1])
 

@@ -84,6 +84,28 @@ class TrackingError(Transform):
         return observation_spec
 
 
+class RawState(Transform):
+    """Keeps the humanoid state in its own units beside the normalised one. To stand before :class:`StateNormalizer`.
+
+    Args:
+        key: of what it writes, ``[..., S]``.
+    """
+
+    def __init__(self, key: str = "raw_state") -> None:
+        super().__init__(in_keys=["humanoid_state"], out_keys=[key])
+
+    def _apply_transform(self, obs: Tensor) -> Tensor:
+        return obs.clone()
+
+    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
+        return self._call(tensordict_reset)
+
+    def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
+        assert isinstance(observation_spec, Composite)
+        observation_spec[self.out_keys[0]] = observation_spec["humanoid_state"].clone()
+        return observation_spec
+
+
 class StateNormalizer(Transform):
     """Running mean and deviation of an observation, normalised in place and clipped (the papers' online z-filter).
 

@@ -114,6 +114,7 @@ def survival_figures(
 
     ``policy``: the mean action. ``start_policy``: the networks before any training. ``base_tracking``: PD towards what
     actions are added to, without a policy. ``reference_tracking``: PD towards the true motion's own joint angles.
+    The last two only where actions are targets of PD controllers.
 
     Args:
         agent: see :func:`egopose.pipeline.load_agent`.
@@ -127,12 +128,9 @@ def survival_figures(
         ``{controller: {"frames": mean frames survived, "fell": share of episodes}}``.
     """
     env = agent.make_env(split, worlds=worlds, threads=threads)
-    controllers = {
-        "policy": agent.actor,
-        "start_policy": start_policy,
-        "base_tracking": base_tracking(env),
-        "reference_tracking": reference_tracking(env),
-    }
+    controllers: dict[str, Controller] = {"policy": agent.actor, "start_policy": start_policy}
+    if env.base_env.problem.action.kind == "pd":
+        controllers |= {"base_tracking": base_tracking(env), "reference_tracking": reference_tracking(env)}
     out = {}
     for name, controller in controllers.items():
         survival = frames_survived(env, controller, seed)
