@@ -133,7 +133,6 @@ class ImitationProblem:
         self._qpos, self._qvel = whole.qpos, whole.qvel
         self._rewarded = {name: getattr(whole, name).contiguous() for name in reward.reads}
         self._range = torch.as_tensor(humanoid.joint_range, dtype=torch.float64).T
-        self._torque_limit = torch.as_tensor(humanoid.torque_limit, dtype=torch.float64)
         self._rest = torch.as_tensor(humanoid.rest_action, dtype=torch.float64)
         self._table: Tensor | None = None
         if action.reference == "regressor":
@@ -178,7 +177,8 @@ class ImitationProblem:
         With ``action.kind`` ``torque``: torques ``[N, nu]`` N m, within their limits.
         """
         if self.action.kind == "torque":
-            return torch.clamp(self.action.scale * action.to(torch.float64), -1.0, 1.0) * self._torque_limit
+            share = torch.clamp(self.action.scale * action.to(torch.float64), -1.0, 1.0)
+            return share * torch.as_tensor(self.humanoid.torque_limit)
         base = self._rest if self._table is None else self._table[frame]
         return torch.clamp(base + self.action.scale * action.to(torch.float64), self._range[0], self._range[1])
 
