@@ -167,6 +167,11 @@ def main(config: DictConfig) -> None:
         agents = [load_agent(path, which=str(values["which"]), overrides=overrides) for path in paths]
         names, videos = take_videos(agents[0].config)
         out = output_folder(values["out"], agents[0].path, str(values["split"]))
+        if agents[0].config["task"]["name"] == "forecasting":
+            from egopose.forecast_evaluation import run_forecast_evaluation
+
+            print(run_forecast_evaluation(values, agents, names, videos, out), flush=True)
+            return
         print(summary(run_evaluation(values, agents, names, videos, out)), flush=True)
     except InputError as error:
         print(f"error: {error}", file=sys.stderr)

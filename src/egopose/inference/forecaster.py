@@ -6,6 +6,7 @@ that a future may be of any length.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -46,10 +47,12 @@ def forecast(
     samples: int = 1,
     horizon: int = 90,
     seed: int = 0,
+    noise_time: float = 0.0,
 ) -> Forecasts:
     """Roll the policy out from the given states.
 
-    With one sample the policy's mean action is taken, with more each future draws its own actions.
+    With one sample the policy's mean action is taken, with more each future draws its own actions: at each step from
+    the policy's distribution, over time as a first-order process, since a person does not tremble.
 
     Args:
         env: over :class:`EgoPoseEnv` with ``WholeFragments`` starts and falls that do not end the episode; window w is
@@ -59,6 +62,8 @@ def forecast(
         samples: K.
         horizon: H, frames.
         seed: of the drawn actions; torch's own generator is left as it was.
+        noise_time: s in which the correlation of a drawn action's noise falls to 1/e; 0 for independent steps, as the
+            policy was trained with.
 
     Raises:
         ValueError: the environment has not ``W * samples`` worlds, or a count is not positive.
@@ -75,11 +80,17 @@ def forecast(
     observation.update(env.transform(base.observe()))
     rows, falls = [], []
     previous, broken = first[0].double(), torch.zeros(count, dtype=torch.bool)
-    mode = ExplorationType.DETERMINISTIC if samples == 1 else ExplorationType.RANDOM
-    with torch.random.fork_rng(devices=[]), set_exploration_type(mode):
-        torch.manual_seed(seed)
+    kept = math.exp(-base.problem.humanoid.control_dt / noise_time) if noise_time > 0 else 0.0
+    generator = torch.Generator().manual_seed(seed)
+    noise = torch.randn(count, *env.action_spec.shape[1:], generator=generator)
+    with set_exploration_type(ExplorationType.DETERMINISTIC):
         for _ in range(horizon):
-            after = env.step(actor(observation))["next"]
+            observation = actor(observation)
+            if samples > 1:
+                observation["action"] = observation["loc"] + observation["scale"] * noise
+                fresh = torch.randn(noise.shape, generator=generator)
+                noise = kept * noise + math.sqrt(1 - kept**2) * fresh
+            after = env.step(observation)["next"]
             broken = broken | after["diverged"].squeeze(-1)
             previous = torch.where(broken[:, None], previous, torch.from_numpy(base.physics.qpos))
             rows.append(previous)

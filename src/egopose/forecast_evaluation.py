@@ -1,0 +1,285 @@
+"""A forecasting policy on windows of held-out takes: its mean future, drawn futures with bands, and the figures."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from egopose.config import from_mapping
+from egopose.data.preparation import flow_name, store_folder
+from egopose.data.store import TakeStore
+from egopose.envs.starts import FragmentLike
+from egopose.errors import InputError
+from egopose.evaluation import forecast_report as report
+from egopose.evaluation import tables
+from egopose.evaluation.forecasting import ForecastWindow, forecast_windows, score_forecasts, true_futures
+from egopose.evaluation.report import RENDERED_NOTE, TakeVideo, file_name, write_motion_files
+from egopose.inference.bands import Bands, fit_scale, quantile_bands
+from egopose.inference.context_states import context_states
+from egopose.inference.forecaster import Forecasts, forecast, placed_states
+from egopose.material import Material
+from egopose.motion.motion import Motion
+from egopose.motion.rotations import Array
+from egopose.regression import load_regressor
+
+if TYPE_CHECKING:
+    from egopose.pipeline import Agent
+
+OURS, DRAWN, STILL = "ours", "ours, drawn", "standing still"
+
+
+@dataclass(frozen=True)
+class ForecastSettings:
+    """The group ``forecast`` of ``conf/evaluate.yaml``.
+
+    Args:
+        horizon: frames of the future, None for as many as the policy was trained to forecast.
+        every: frames between windows.
+        samples: drawn futures a window; 1 for none.
+        level: of the error bands.
+        noise_time: s, see :func:`egopose.inference.forecaster.forecast`.
+        start: where forecasts begin: ``regressor`` (the state regressor on the context alone) or ``reference`` (the
+            true state, as in training).
+        worlds: simulated side by side.
+        seed: of the drawn futures.
+    """
+
+    horizon: int | None
+    every: int
+    samples: int
+    level: float
+    noise_time: float
+    start: str
+    worlds: int
+    seed: int
+
+    def __post_init__(self) -> None:
+        if self.start not in ("regressor", "reference"):
+            raise InputError(
+                "conf/evaluate.yaml", "forecast.start", f"must be regressor or reference, not {self.start}"
+            )
+        for name in ("every", "samples", "worlds"):
+            if getattr(self, name) < 1:
+                raise InputError("conf/evaluate.yaml", f"forecast.{name}", "must be at least 1")
+        if self.horizon is not None and self.horizon < 10:
+            raise InputError("conf/evaluate.yaml", "forecast.horizon", "must be at least 10 frames")
+
+
+def run_forecast_evaluation(
+    config: Mapping[str, Any],
+    agents: Sequence[Agent],
+    names: Sequence[str],
+    videos: Sequence[TakeVideo | None],
+    out: Path,
+) -> str:
+    """Score forecasting agents (runs with different seeds), write everything, and return what the terminal shows.
+
+    Args:
+        config: resolved ``conf/evaluate.yaml``.
+        agents: see :func:`egopose.pipeline.load_agent`; all on the same takes.
+        names: of all takes of the material.
+        videos: of all takes; None where there is none to show.
+        out: folder of the results.
+
+    Raises:
+        InputError: a setting is wrong, or no fragment of the split is long enough for a window.
+    """
+    settings = from_mapping(ForecastSettings, config["forecast"], "conf/evaluate.yaml: forecast")
+    material, split = agents[0].material, str(config["split"])
+    humanoid, fps = material.humanoid, 1.0 / material.humanoid.control_dt
+    windows = windows_of(agents[0], split, settings)
+    labels = [f"{names[w.take]}_{w.start}" for w in windows]
+    truth = _truth(material, windows)
+    hands = [int(d) for d in humanoid.hand_dofs]
+
+    methods: dict[str, list[Any]] = {OURS: [], DRAWN: [], STILL: []}
+    coverage, futures = [], []
+    for agent in agents:
+        states = start_states(agent, windows, settings)
+        mean = forecast_windows_of(agent, windows, states, 1, settings, int(config["threads"]))
+        methods[OURS].append(score_forecasts(truth, windows, mean.qpos, hands, fps))
+        still = states[0].numpy()[:, None, None].repeat(windows[0].horizon, axis=2)
+        methods[STILL].append(score_forecasts(truth, windows, still, hands, fps))
+        drawn, bands = None, None
+        if settings.samples > 1:
+            drawn = forecast_windows_of(agent, windows, states, settings.samples, settings, int(config["threads"]))
+            methods[DRAWN].append(score_forecasts(truth, windows, drawn.qpos, hands, fps))
+            bands, found = _bands(agent, drawn.qpos, truth, settings, int(config["threads"]), hands)
+            coverage.append(found)
+        futures.append((mean, drawn, bands))
+    methods = {name: runs for name, runs in methods.items() if runs}
+
+    interval = config["interval"]
+    comparison = report.compare_forecasts(
+        methods, STILL, float(interval["level"]), int(interval["draws"]), int(interval["seed"])
+    )
+    rendered = any(v is not None and v.rendered for v in videos)
+    notes = [
+        f"{len(agents)} run{'s' if len(agents) > 1 else ''}, {len(windows)} windows of "
+        f"{len({w.take for w in windows})} takes, split {split}; {windows[0].context} frames seen, "
+        f"{windows[0].horizon} forecast, begun from the {settings.start}'s state.",
+        "A figure at a horizon is the mean up to it; the mean over windows in a take, then over takes.",
+        *(_coverage_note(number, found, settings.level) for number, found in enumerate(coverage)),
+        *([RENDERED_NOTE] if rendered else []),
+    ]
+    about = {
+        "checkpoints": [str(agent.path) for agent in agents],
+        "split": split,
+        "rendered_video": rendered,
+        "settings": {key: config[key] for key in ("forecast", "interval")},
+        "fallen_share": [float(mean.fallen.mean()) for mean, _, _ in futures],
+        "diverged": [int(mean.diverged.sum()) for mean, _, _ in futures],
+        "coverage": coverage,
+    }
+    report.write_forecast_results(out, comparison, methods, windows, labels, about, notes)
+    written = _write_windows(out, config, material, windows, labels, truth, futures[0], videos)
+    header, body = report.rows(comparison)
+    widths = [max(len(line[i]) for line in [header, *body]) for i in range(len(header))]
+    table = "\n".join("  ".join(c.ljust(w) for c, w in zip(line, widths, strict=True)) for line in [header, *body])
+    return "\n".join([table, *notes, *(f"video: {path}" for path in written), f"all results: {out}"])
+
+
+def windows_of(agent: Agent, split: str, settings: ForecastSettings) -> list[ForecastWindow]:
+    """The windows of a split.
+
+    Raises:
+        InputError: there is none; names the longest horizon there is room for.
+    """
+    if split not in ("train", "test"):
+        raise InputError("conf/evaluate.yaml", "split", f"must be train or test, not {split!r}")
+    fragments: Sequence[FragmentLike] = agent.material.train if split == "train" else agent.material.test
+    context = int(agent.config["task"]["context"])
+    horizon = settings.horizon or int(agent.config["task"]["horizon"]) - 1
+    windows = forecast_windows(fragments, context, horizon, settings.every)
+    if not windows:
+        longest = max(f.stop - f.start for f in fragments) - context
+        cause = f"no {split} fragment holds {context} + {horizon} frames; forecast.horizon may be at most {longest}"
+        raise InputError("conf/evaluate.yaml", "forecast.horizon", cause)
+    return windows
+
+
+def start_states(agent: Agent, windows: Sequence[ForecastWindow], settings: ForecastSettings) -> tuple[Tensor, Tensor]:
+    """qpos ``[W, nq]`` and qvel ``[W, nv]`` at each window's last frame seen.
+
+    Raises:
+        InputError: the run's state regressor or the flow it reads is not there.
+    """
+    material, offsets = agent.material, agent.material.takes.offsets.tolist()
+    now = torch.tensor([offsets[w.take] + w.now for w in windows])
+    reference = {key: torch.as_tensor(material.reference[key][now]).double() for key in ("qpos", "qvel")}
+    if settings.start == "reference":
+        return reference["qpos"], reference["qvel"]
+    if material.regressor is None:
+        raise InputError(agent.path, "regressor", "forecasts begin from the state regressor's state, and there is none")
+    model, _ = load_regressor(material.regressor)
+    flow = TakeStore.open(store_folder(agent.config)).flow(flow_name(agent.config))
+    first = [offsets[w.take] + w.start for w in windows]
+    states = context_states(model, flow, first, windows[0].context)[:, -1].double().numpy()
+    return placed_states(states, reference["qpos"].numpy(), np.asarray(material.humanoid.joint_range))
+
+
+def forecast_windows_of(
+    agent: Agent,
+    windows: Sequence[ForecastWindow],
+    states: tuple[Tensor, Tensor],
+    samples: int,
+    settings: ForecastSettings,
+    threads: int,
+) -> Forecasts:
+    """:func:`egopose.inference.forecaster.forecast` of all windows, as many at a time as ``settings.worlds`` allow."""
+    parts, together = [], max(1, settings.worlds // samples)
+    for at in range(0, len(windows), together):
+        part = windows[at : at + together]
+        env = agent.make_env(
+            worlds=len(part) * samples,
+            threads=threads,
+            fragments=[window for window in part for _ in range(samples)],
+            whole_fragments=True,
+            falls_end=False,
+        )
+        qpos, qvel = (state[at : at + together] for state in states)
+        horizon, seed = part[0].horizon, settings.seed + at
+        parts.append(forecast(env, agent.actor, qpos, qvel, samples, horizon, seed, settings.noise_time))
+        env.close()
+    return Forecasts(*(np.concatenate([getattr(p, name) for p in parts]) for name in ("qpos", "fallen", "diverged")))
+
+
+def _truth(material: Material, windows: Sequence[ForecastWindow]) -> Array:
+    reference = torch.as_tensor(material.reference["qpos"]).double().numpy()
+    return true_futures(reference, material.takes.offsets.tolist(), windows)
+
+
+def _bands(
+    agent: Agent, drawn: Array, truth: Array, settings: ForecastSettings, threads: int, hands: list[int]
+) -> tuple[Bands, dict[str, Any]]:
+    """Bands of the joints, calibrated on windows of the training takes, and how often the truth is inside."""
+    used = [7 + d for d in range(drawn.shape[-1] - 7) if d not in hands]
+    bands = quantile_bands(drawn[..., used], settings.level)
+    kept = windows_of(agent, "train", settings)
+    futures = forecast_windows_of(agent, kept, start_states(agent, kept, settings), settings.samples, settings, threads)
+    known = quantile_bands(futures.qpos[..., used], settings.level)
+    known_truth = _truth(agent.material, kept)[..., used]
+    scale = fit_scale(known, known_truth, settings.level)
+    calibrated, inside = bands.scaled(scale), bands.covers(truth[..., used])
+    covered = calibrated.covers(truth[..., used])
+    return calibrated, {
+        "level": settings.level,
+        "calibration_windows": len(kept),
+        "windows": len(drawn),
+        "calibration": float(known.scaled(scale).covers(known_truth).mean()),
+        "held_out": float(covered.mean()),
+        "held_out_uncalibrated": float(inside.mean()),
+        "held_out_per_frame": covered.mean(axis=(0, 2)).tolist(),
+        "scale_per_frame": scale.tolist(),
+        "mean_width_rad": float((calibrated.high - calibrated.low).mean()),
+    }
+
+
+def _coverage_note(run: int, found: Mapping[str, Any], level: float) -> str:
+    return (
+        f"Run {run}: bands of nominal {level:.0%} hold {found['held_out']:.1%} of the joint angles on these windows "
+        f"({found['held_out_uncalibrated']:.1%} before calibration on {found['calibration_windows']} training windows)."
+    )
+
+
+def _write_windows(
+    out: Path,
+    config: Mapping[str, Any],
+    material: Material,
+    windows: Sequence[ForecastWindow],
+    labels: Sequence[str],
+    truth: Array,
+    futures: tuple[Forecasts, Forecasts | None, Bands | None],
+    videos: Sequence[TakeVideo | None],
+) -> list[Path]:
+    """Motions and bands of each window, and videos of the first ones; returns the videos."""
+    humanoid, fps = material.humanoid, 1.0 / material.humanoid.control_dt
+    mean, drawn, bands = futures
+    used = [d for d in range(truth.shape[-1] - 7) if d not in {int(h) for h in humanoid.hand_dofs}]
+    dof_names = [f"{joint.name}_{k}" for joint in humanoid.skeleton.joints[1:] for k in range(len(joint.dofs))]
+    shown, written = config["video"]["takes"], []
+    for w, (window, label) in enumerate(zip(windows, labels, strict=True)):
+        folder = out / "windows" / file_name(label)
+        folder.mkdir(parents=True, exist_ok=True)
+        motions = {"forecast": mean.qpos[w, 0], "reference": truth[w]}
+        motions |= {} if drawn is None else {f"future_{k}": drawn.qpos[w, k] for k in range(min(3, len(drawn.qpos[w])))}
+        for name, qpos in motions.items():
+            write_motion_files(folder, name, Motion(humanoid.skeleton, qpos, fps, f"{label} {name}"))
+        if bands is not None:
+            edges = {"low": bands.low[w], "median": bands.median[w], "high": bands.high[w]}
+            columns = {f"{dof_names[d]}_{edge}": v[:, i] for i, d in enumerate(used) for edge, v in edges.items()}
+            tables.write_columns_csv(folder / "bands.csv", columns)
+        if shown is not None and w >= shown:
+            continue
+        others = np.zeros((0, *truth[w].shape)) if drawn is None else drawn.qpos[w, :3]
+        path = folder / "futures.mp4"
+        size = int(config["video"]["size"])
+        report.write_futures_video(path, humanoid, window, mean.qpos[w, 0], truth[w], others, videos[window.take], size)
+        written.append(path)
+    return written

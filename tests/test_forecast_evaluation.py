@@ -1,0 +1,155 @@
+"""An evaluation of forecasts, from agents to files, on the real humanoid with made-up motion and untrained networks."""
+
+from __future__ import annotations
+
+import csv
+import json
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from env_stand_in import Piece, group
+
+from egopose import pipeline
+from egopose.data.reference import reference_states
+from egopose.envs.problem import TakeTable
+from egopose.errors import InputError
+from egopose.evaluation.report import TakeVideo
+from egopose.forecast_evaluation import run_forecast_evaluation
+from egopose.humanoid.config import HumanoidConfig, SimConfig
+from egopose.humanoid.model import build_humanoid
+from egopose.inference.context_states import context_states
+from egopose.models.regressor import StateRegressor
+from egopose.motion.io import read_motion
+from egopose.motion.motion import Motion
+from egopose.training.fragments import Span
+from egopose.training.predictions import predict_span
+from egopose.vision.video import probe_video, write_video
+
+FRAMES, CONTEXT = 40, 5
+EVALUATE: dict[str, Any] = {
+    "split": "test",
+    "forecast": {
+        "horizon": None,
+        "every": 8,
+        "samples": 4,
+        "level": 0.8,
+        "noise_time": 0.3,
+        "start": "reference",
+        "worlds": 10,
+        "seed": 0,
+    },
+    "interval": {"level": 0.95, "draws": 50, "seed": 0},
+    "video": {"takes": 1, "size": 64},
+    "threads": 1,
+}
+
+
+@pytest.fixture(scope="module")
+def agent() -> pipeline.Agent:
+    humanoid = build_humanoid(HumanoidConfig.from_mapping(group("humanoid", "default")), SimConfig(substeps=3))
+    qpos = np.tile(humanoid.skeleton.rest_qpos(), (FRAMES, 1))
+    qpos[:, 2] = 0.95
+    qpos[:, 7:] = humanoid.rest_action + 0.05 * np.sin(np.linspace(0, 6, FRAMES))[:, None]
+    states = reference_states(humanoid, Motion(humanoid.skeleton, qpos, 30.0))
+    heads = states["xpos"][:, humanoid.head, 2].min().expand(2).clone()
+    material = pipeline.Material(
+        humanoid,
+        torch.cat([states, states]),
+        TakeTable(torch.tensor([0, FRAMES]), torch.tensor([FRAMES, FRAMES]), heads),
+        train=[Piece(0, 0, FRAMES)],
+        test=[Piece(0, 4, FRAMES), Piece(1, 0, 20)],
+        visual_features=torch.randn(2 * FRAMES, 6, generator=torch.Generator().manual_seed(0)),
+    )
+    model = group("model", "forecasting")
+    config = {
+        "seed": 5,
+        "task": {**group("task", "forecasting"), "context": CONTEXT, "horizon": 13, "minimum": 6},
+        "reward": group("reward", "forecasting"),
+        "algo": {},
+        "model": {
+            **model,
+            "hidden": [8],
+            "context": {**model["context"], "hidden_size": 4, "horizon": CONTEXT},
+            "memory": {"hidden_size": 7},
+        },
+    }
+    actor, critic = pipeline.build_networks(config, material, pipeline.build_env(config, material, worlds=1))
+    return pipeline.Agent(
+        actor, critic, config, material, partial(pipeline.build_env, config, material), Path("run/checkpoints/1")
+    )
+
+
+def test_everything_is_written_and_agrees(agent: pipeline.Agent, tmp_path: Path) -> None:
+    write_video(tmp_path / "wearer.mp4", [np.full((48, 64, 3), 90, np.uint8)] * FRAMES, 30.0)
+    video = TakeVideo(tmp_path / "wearer.mp4", 0.0, rendered=True)
+    out = tmp_path / "out"
+    try:
+        text = run_forecast_evaluation(EVALUATE, [agent, agent], ["walk/1", "bow"], [video, None], out)
+    except RuntimeError as error:
+        pytest.skip(f"no OpenGL here: {error}")
+    saved = json.loads((out / "results.json").read_text())
+    assert saved["windows"] == ["walk/1_4", "walk/1_12", "walk/1_20", "bow_0"]
+    assert saved["rendered_video"]
+    assert set(saved["figures"]) == {"ours", "ours, drawn", "ours, drawn, best of 4", "standing still"}
+    shortest, *longer = saved["figures"]["ours"]["E_pose"]  # 12 frames: 1/3 s alone
+    assert (shortest["runs"], shortest["takes"]) == (2, 2)
+    assert longer == [None] * 4
+    assert saved["figures"]["standing still"]["A_accl"][0]["value"] == 0
+    coverage = saved["coverage"][0]
+    assert coverage["calibration"] == pytest.approx(0.8, abs=0.02)
+    assert coverage["calibration_windows"] == 3
+    assert len(coverage["held_out_per_frame"]) == 12
+
+    with (out / "windows.csv").open() as stream:
+        rows = [row for row in csv.DictReader(stream) if (row["method"], row["run"]) == ("ours", "0")]
+    per_window = {row["window"]: float(row["E_pose"]) for row in rows}
+    walk = np.mean([per_window[f"walk/1_{start}"] for start in (4, 12, 20)])
+    assert shortest["value"] == pytest.approx((walk + per_window["bow_0"]) / 2, rel=1e-6)
+
+    folder = out / "windows/walk_1_4"
+    forecast, future = (read_motion(folder / f"{name}.npz") for name in ("forecast", "future_0"))
+    assert len(forecast) == len(future) == 12
+    assert not np.array_equal(forecast.qpos, future.qpos)
+    np.testing.assert_allclose(
+        read_motion(folder / "reference.npz").qpos, agent.material.reference["qpos"][9:21].numpy(), atol=1e-6
+    )
+    with (folder / "bands.csv").open() as stream:
+        bands = list(csv.DictReader(stream))
+    assert len(bands) == 12
+    assert float(bands[3]["Spine_0_low"]) < float(bands[3]["Spine_0_median"]) < float(bands[3]["Spine_0_high"])
+    assert (probe_video(folder / "futures.mp4").width, probe_video(folder / "futures.mp4").frames) == (128, 12)
+    assert not (out / "windows/walk_1_12/futures.mp4").exists()
+    for word in ("E_pose", "nominal 80%", str(out)):
+        assert word in text
+
+
+def test_bad_settings_are_named(agent: pipeline.Agent, tmp_path: Path) -> None:
+    def fails(match: str, **forecast: Any) -> None:
+        settings = {**EVALUATE, "forecast": {**EVALUATE["forecast"], **forecast}}
+        with pytest.raises(InputError, match=match):
+            run_forecast_evaluation(settings, [agent], ["a", "b"], [None, None], tmp_path)
+
+    fails("at most 31", horizon=60)
+    fails("regressor or reference", start="somewhere")
+    fails("none", start="regressor")
+    fails("at least 1", samples=0)
+    with pytest.raises(InputError, match="split"):
+        run_forecast_evaluation({**EVALUATE, "split": "all"}, [agent], ["a", "b"], [None, None], tmp_path)
+
+
+def test_states_of_a_context_know_nothing_of_what_follows() -> None:
+    torch.manual_seed(0)
+    model = StateRegressor(None, torch.zeros(5), torch.ones(5), feature_size=6, context_size=4, hidden=[8]).eval()
+    features = torch.randn(40, 6)
+    states = context_states(model, features, [3, 20], 7)
+    assert states.shape == (2, 7, 5)
+    torch.testing.assert_close(states[1], predict_span(model, features[20:27], Span(0, 7), 4)["humanoid_state"])
+    later = features.clone()
+    later[27:] += 1.0
+    torch.testing.assert_close(context_states(model, later, [3, 20], 7), states)
+    whole = predict_span(model, features, Span(0, 40), 64)["humanoid_state"]
+    assert not torch.allclose(whole[20:27], states[1], atol=1e-4)
