@@ -27,7 +27,12 @@ if TYPE_CHECKING:
 
 
 def video_material(
-    humanoid: HumanoidModel, regressor: StateRegressor, flow: np.ndarray, encode_batch: int, name: str
+    humanoid: HumanoidModel,
+    regressor: StateRegressor,
+    flow: np.ndarray,
+    made_with: Mapping[str, Any],
+    name: str,
+    lookahead: int | None = None,
 ) -> tuple[Material, Motion]:
     """What the policy needs of a video: a take whose reference is what the state regressor makes of it by itself.
 
@@ -38,8 +43,9 @@ def video_material(
         humanoid: the run's.
         regressor: trained, in eval mode.
         flow: ``[T, 2, S, S]`` of the video at the control rate.
-        encode_batch: frames a forward pass.
+        made_with: the groups ``vision`` and ``regressor`` it was trained with.
         name: of the take.
+        lookahead: future frames that each frame's context may see; None for the whole video.
 
     Returns:
         The material and PoseReg's motion.
@@ -62,7 +68,8 @@ def video_material(
     frames = len(flow)
     if frames < 2:
         raise InputError(name, "video", f"has {frames} frames at 30 frames/s; at least 2 are needed")
-    seen = predict_span(regressor, torch.from_numpy(flow), Span(0, frames), encode_batch)
+    batch = int(made_with["vision"]["encode_batch"])
+    seen = predict_span(regressor, torch.from_numpy(flow), Span(0, frames), batch, lookahead)
     states = seen["humanoid_state"].numpy()
     facing = np.array([1.0, 0.0, 0.0, 0.0])
     motion = pose_regression(
@@ -71,6 +78,9 @@ def video_material(
     reference = reference_states(humanoid, motion)
     lowest = reference["xpos"][:, humanoid.head, 2].min().reshape(1)
     whole = [Fragment(0, 0, frames)]
+    # A policy trained on the tables of several fits reads the regressor's states for a context.
+    crossed = int(made_with["regressor"]["cross_fit"]) > 1
+    context = regressor.normalise(seen["humanoid_state"]) if crossed else seen["visual_context"]
     material = Material(
         humanoid,
         reference,
@@ -78,7 +88,7 @@ def video_material(
         train=whole,
         test=whole,
         visual_features=seen["visual_features"],
-        visual_context=seen["visual_context"],
+        visual_context=context,
         joint_targets=joint_targets(seen["humanoid_state"], humanoid),
         states=seen["humanoid_state"],
     )
@@ -112,8 +122,8 @@ def run_estimate(config: Mapping[str, Any], agent: Agent, pose_motion: Motion, v
     guard = FailSafe(1, from_mapping(FailSafeSettings, config["failsafe"], "conf/estimate.yaml: failsafe"))
     torch.set_num_threads(1)
     env = agent.make_env("test", worlds=1, threads=1, whole_fragments=True, falls_end=False)
-    assert agent.material.states is not None
-    (estimate,) = estimate_takes(env, agent.actor, agent.critic, agent.material.states, guard)
+    lookahead = allowed_lookahead(config)
+    (estimate,) = estimate_takes(env, agent.actor, agent.critic, agent.followed_states(), guard, lookahead)
     env.close()
     humanoid = agent.material.humanoid
     motion = estimate.motion(humanoid, pose_motion.name)
@@ -125,6 +135,20 @@ def run_estimate(config: Mapping[str, Any], agent: Agent, pose_motion: Motion, v
     write_side_by_side(out / "side_by_side.mp4", humanoid, motions, seen, 0, int(config["size"]))
     print(f"{len(motion)} frames, {estimate.n_resets} resets by the fail-safe; written to {out}", flush=True)
     return out
+
+
+def allowed_lookahead(config: Mapping[str, Any]) -> int | None:
+    """Future frames a frame's context may see by ``conf/estimate.yaml``, None for all.
+
+    Raises:
+        InputError: it is no number of frames.
+    """
+    lookahead = config["lookahead"]
+    if not config["causal"]:
+        return None
+    if not isinstance(lookahead, int) or lookahead < 0:
+        raise InputError("conf/estimate.yaml", "lookahead", f"must be a number of frames, not {lookahead!r}")
+    return lookahead
 
 
 def run_folder(checkpoint: Path) -> Path:
@@ -154,9 +178,9 @@ def estimate_video(values: Mapping[str, Any]) -> Path:
     run = read_json(checkpoint, "config")
     humanoid = humanoid_of(run)
     regressor, made_with = load_regressor(run_folder(checkpoint) / "regressor")
-    vision = made_with["vision"]
-    flow = extract_flow(video, vision["flow"], 1.0 / humanoid.control_dt, float(values["offset"]))
-    material, pose_motion = video_material(humanoid, regressor, flow, int(vision["encode_batch"]), video.stem)
+    lookahead = allowed_lookahead(values)
+    flow = extract_flow(video, made_with["vision"]["flow"], 1.0 / humanoid.control_dt, float(values["offset"]))
+    material, pose_motion = video_material(humanoid, regressor, flow, made_with, video.stem, lookahead)
     return run_estimate(values, load_agent(checkpoint, material), pose_motion, video, out)
 
 

@@ -12,6 +12,7 @@ from typing import Any
 
 import torch
 from tensordict import TensorDictBase
+from scipy.ndimage import gaussian_filter1d
 from torch import Tensor
 
 from egopose.data.preparation import fingerprint_of, flow_name, humanoid_of, prepare
@@ -27,6 +28,8 @@ from egopose.regression import kept_tables, regressor_tables
 from egopose.untrusted import read_json
 
 PROVENANCE = "provenance.json"
+#: Frames, a third of a second: the look-ahead of the causal form (conf/regressor).
+_LOOKAHEAD = 10
 
 
 @dataclass(frozen=True)
@@ -151,6 +154,39 @@ def _with_tables(config: Mapping[str, Any], store: TakeStore, tables: TensorDict
         states=tables["humanoid_state"],
         regressor=weights,
         store_fingerprint=store.fingerprint,
+    )
+
+
+def smoothed(material: Material, deviation: float) -> Material:
+    """The material with what the regressor saw smoothed in time, take by take.
+
+    The regressor judges each frame nearly by itself: its joints jitter at 14 rad/s^2 where people's move at 3. States
+    are smoothed number by number (a quaternion so near its neighbours may be), joint targets and context likewise.
+
+    Args:
+        material: with tables of a regressor.
+        deviation: s, of a Gaussian cut at a third of a second, which is what the causal form may look ahead; 0: as it is.
+    """
+    if deviation <= 0:
+        return material
+    frames = deviation / material.humanoid.control_dt
+    spans = list(zip(material.takes.offsets.tolist(), material.takes.lengths.tolist(), strict=True))
+
+    def smooth(table: Tensor | None) -> Tensor | None:
+        if table is None:
+            return None
+        out = table.clone()
+        for offset, length in spans:
+            rows = table[offset : offset + length].double().numpy()
+            kept = gaussian_filter1d(rows, frames, axis=0, mode="nearest", radius=_LOOKAHEAD)
+            out[offset : offset + length] = torch.from_numpy(kept).to(table.dtype)
+        return out
+
+    return replace(
+        material,
+        states=smooth(material.states),
+        joint_targets=smooth(material.joint_targets),
+        visual_context=smooth(material.visual_context),
     )
 
 

@@ -30,7 +30,7 @@ from egopose.envs.transforms import RawState, StateNormalizer, TrackingError, Vi
 from egopose.errors import InputError
 from egopose.evaluation.report import TakeVideo
 from egopose.evaluation.survival import frames_survived
-from egopose.material import Material, load_material, motion_material, run_material
+from egopose.material import Material, load_material, motion_material, run_material, smoothed
 from egopose.models.policy import PolicySettings, build_actor, build_critic
 from egopose.models.recurrent import collecting_policy, hidden_keys
 from egopose.runtime import settle_heap
@@ -90,6 +90,7 @@ def build_env(
         InputError: the configuration asks for a table the material lacks, lets a forecast see the future, or the rooms
             refuse it.
     """
+    material = smoothed(material, float(config["task"]["action"].get("smoothing", 0.0)))
     task = dict(config["task"])
     forecasts = task.get("context") is not None
     if forecasts:
@@ -286,6 +287,17 @@ class Agent:
     material: Material
     make_env: Callable[..., TransformedEnv]
     path: Path
+
+    def followed_states(self) -> Tensor:
+        """``[F, S]`` humanoid states of the regressor as the policy follows them, smoothed as ``task.action`` says.
+
+        Raises:
+            InputError: there is no regressor.
+        """
+        states = smoothed(self.material, float(self.config["task"]["action"].get("smoothing", 0.0))).states
+        if states is None:
+            raise InputError(self.path, "regressor", "the policy starts from the state regressor, and there is none")
+        return states
 
 
 def load_agent(

@@ -51,6 +51,8 @@ class ActionSettings:
         scale: of the action, rad per unit.
         velocity_feedforward: with ``regressor``, kd/kp times the table's joint velocity times this is added to the
             target, against the lag of a PD controller.
+        smoothing: s, standard deviation in time of a Gaussian over what the regressor saw (joint targets, states, context)
+            before it is followed; at most a third of a second either side counts.
         kind: ``pd``: actions move the targets of PD controllers; ``torque``: they are torques, a unit being the joint's
             limit times ``scale``, and the other settings are not read.
         joint_damping: with ``torque``, see :func:`egopose.humanoid.torques.torque_driven`.
@@ -59,12 +61,15 @@ class ActionSettings:
     reference: str = "rest"
     scale: float = 1.0
     velocity_feedforward: float = 0.0
+    smoothing: float = 0.0
     kind: str = "pd"
     joint_damping: float = 0.0
 
     def __post_init__(self) -> None:
         if self.reference not in ("rest", "regressor"):
             raise ValueError(f"action.reference must be rest or regressor, not {self.reference!r}")
+        if not 0.0 <= self.smoothing <= 1.0:
+            raise ValueError(f"action.smoothing must lie in 0..1 s, not {self.smoothing}")
         if self.kind not in ("pd", "torque"):
             raise ValueError(f"action.kind must be pd or torque, not {self.kind!r}")
 

@@ -71,7 +71,7 @@ def evaluate_agent(
     worlds = len(fragments)
     env = agent.make_env(split, worlds=worlds, threads=threads, whole_fragments=True, falls_end=False)
     guard = FailSafe(worlds, failsafe)
-    estimates = estimate_takes(env, agent.actor, agent.critic, material.states, guard)
+    estimates = estimate_takes(env, agent.actor, agent.critic, agent.followed_states(), guard)
     env.close()
     return [
         _result(agent, fragment, name, estimate, contact)
