@@ -131,7 +131,7 @@ def build_env(
         scale = _state_scale(material, float(config["regressor"]["std_floor"]))
         clip = float(task["tracking_error_clip"])
         transforms.insert(0, TrackingError(material.states, material.takes.following(), scale, clip))
-    if "discriminator" in config["algo"]:
+    if "discriminator" in config.get("algo", ()):
         transforms.insert(0, RawState())
     if forecasts:
         transforms.append(TimeLeft(int(task["horizon"]) - 1))
