@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from tensordict import TensorDictBase
 from scipy.ndimage import gaussian_filter1d
+from tensordict import TensorDictBase
 from torch import Tensor
 
 from egopose.data.preparation import fingerprint_of, flow_name, humanoid_of, prepare
@@ -165,7 +165,8 @@ def smoothed(material: Material, deviation: float) -> Material:
 
     Args:
         material: with tables of a regressor.
-        deviation: s, of a Gaussian cut at a third of a second, which is what the causal form may look ahead; 0: as it is.
+        deviation: s, of a Gaussian cut at a third of a second, which is what the causal form may look ahead; 0 for
+            the material as it is.
     """
     if deviation <= 0:
         return material

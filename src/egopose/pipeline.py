@@ -288,7 +288,7 @@ class Agent:
     make_env: Callable[..., TransformedEnv]
     path: Path
 
-    def followed_states(self) -> Tensor:
+    def followed_states(self) -> torch.Tensor:
         """``[F, S]`` humanoid states of the regressor as the policy follows them, smoothed as ``task.action`` says.
 
         Raises:

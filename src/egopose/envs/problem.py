@@ -51,8 +51,8 @@ class ActionSettings:
         scale: of the action, rad per unit.
         velocity_feedforward: with ``regressor``, kd/kp times the table's joint velocity times this is added to the
             target, against the lag of a PD controller.
-        smoothing: s, standard deviation in time of a Gaussian over what the regressor saw (joint targets, states, context)
-            before it is followed; at most a third of a second either side counts.
+        smoothing: s, standard deviation in time of a Gaussian over what the regressor saw (joint targets, states,
+            context) before it is followed; at most a third of a second either side counts.
         kind: ``pd``: actions move the targets of PD controllers; ``torque``: they are torques, a unit being the joint's
             limit times ``scale``, and the other settings are not read.
         joint_damping: with ``torque``, see :func:`egopose.humanoid.torques.torque_driven`.
