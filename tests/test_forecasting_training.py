@@ -212,3 +212,25 @@ def test_the_time_left_follows_the_decay(material: Material) -> None:
     batch = env.rollout(6, policy, break_when_any_done=False)
     torch.testing.assert_close(batch["time_left"][0, :, 0], 1 - torch.arange(6) / HORIZON)
     assert environment(2).observation_spec.get("time_left", None) is None
+
+
+def test_actions_may_be_relative_to_the_pose_an_episode_begins_with(material: Material) -> None:
+    config = configuration()
+    config["task"] = {**config["task"], "action": {**config["task"]["action"], "reference": "start"}}
+    env = pipeline.build_env(config, material, worlds=3)
+    env.reset()
+    base = env.base_env
+    actions = torch.zeros(env.action_spec.shape)
+    for _ in range(12):  # resets on the way
+        env.step_and_maybe_reset(env.observation_spec.zero().set("action", actions))
+    begun = base.problem.reference_at(base._start)["qpos"][:, 7:]
+    torch.testing.assert_close(base.placed, begun)
+    action = torch.full((3, begun.shape[1]), 0.05)
+    low, high = base.problem._range
+    wanted = torch.clamp(begun + 0.05, low, high)
+    torch.testing.assert_close(base.problem.target(action, base.frame, base.placed), wanted, atol=1e-7, rtol=0)
+    again = pipeline.build_env(config, material, worlds=3).base_env
+    again.load_state_dict(base.state_dict())
+    assert torch.equal(again.placed, base.placed)
+    with pytest.raises(ValueError, match="placed"):
+        base.problem.target(action, base.frame)

@@ -66,6 +66,7 @@ class EgoPoseEnv(EnvBase):
         self._generator = torch.Generator().manual_seed(seed)
         counter = torch.zeros(n_worlds, dtype=torch.int64)
         self._take, self._start, self._stop, self._frame = (counter.clone() for _ in range(4))
+        self.placed = torch.zeros(n_worlds, humanoid.mj_model.nu, dtype=torch.float64)
         self._make_specs(n_worlds)
 
     def _make_specs(self, n: int) -> None:
@@ -136,6 +137,7 @@ class EgoPoseEnv(EnvBase):
         if not (torch.isfinite(qpos).all() and torch.isfinite(qvel).all()):
             raise ValueError("a world cannot be placed at a state that is not finite")
         self.physics.set_state(worlds.numpy(), qpos.double().numpy(), qvel.double().numpy())
+        self.placed[worlds] = qpos[:, 7:].double()
 
     def observe(self, worlds: Tensor | None = None) -> TensorDict:
         """The present observation of ``worlds [n]`` (default all), as a reset would return it (after :meth:`place`)."""
@@ -172,7 +174,7 @@ class EgoPoseEnv(EnvBase):
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
         # A world past its fragment's end (evaluation steps on until the last world is done) stays on its last frame.
         self._frame = torch.minimum(self._frame + 1, self._stop - 1)
-        target = self.problem.target(tensordict["action"].detach(), self._frame)
+        target = self.problem.target(tensordict["action"].detach(), self._frame, self.placed)
         diverged = torch.from_numpy(self.physics.step(target.numpy()).copy())
         state = self.problem.view({k: torch.from_numpy(v) for k, v in self.physics.body_state().items()})
         reward, terms = self.problem.rewards(state, self._frame, self._frame - self._start)
@@ -206,6 +208,7 @@ class EgoPoseEnv(EnvBase):
             "start": self._start.clone(),
             "stop": self._stop.clone(),
             "frame": self._frame.clone(),
+            **({"placed": self.placed.clone()} if self.problem.action.reference == "start" else {}),
         }
 
     def load_state_dict(self, state_dict: dict[str, Tensor], *args: Any, **kwargs: Any) -> None:
@@ -219,6 +222,8 @@ class EgoPoseEnv(EnvBase):
         self._take, self._start, self._stop, self._frame = (
             state_dict[k].clone() for k in ("take", "start", "stop", "frame")
         )
+        if self.problem.action.reference == "start":
+            self.placed = state_dict["placed"].clone()
 
     def close(self, *, raise_if_closed: bool = True) -> None:
         self.physics.close()

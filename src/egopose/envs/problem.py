@@ -47,7 +47,8 @@ class ActionSettings:
     """What an action is added to.
 
     Args:
-        reference: ``rest``: the rest pose (the paper); ``regressor``: a table of joint targets, one row a frame.
+        reference: ``rest``: the rest pose (the paper); ``regressor``: a table of joint targets, one row a frame;
+            ``start``: the joint angles the body was placed with, as a reset or an estimated state put it there.
         scale: of the action, rad per unit.
         velocity_feedforward: with ``regressor``, kd/kp times the table's joint velocity times this is added to the
             target, against the lag of a PD controller.
@@ -66,8 +67,8 @@ class ActionSettings:
     joint_damping: float = 0.0
 
     def __post_init__(self) -> None:
-        if self.reference not in ("rest", "regressor"):
-            raise ValueError(f"action.reference must be rest or regressor, not {self.reference!r}")
+        if self.reference not in ("rest", "regressor", "start"):
+            raise ValueError(f"action.reference must be rest, regressor or start, not {self.reference!r}")
         if not 0.0 <= self.smoothing <= 1.0:
             raise ValueError(f"action.smoothing must lie in 0..1 s, not {self.smoothing}")
         if self.kind not in ("pd", "torque"):
@@ -176,15 +177,22 @@ class ImitationProblem:
         """``state`` and what follows from it; the functions below take either, and share the work given a view."""
         return state if isinstance(state, BodyView) else BodyView(state, self.layout)
 
-    def target(self, action: Tensor, frame: Tensor) -> Tensor:
+    def target(self, action: Tensor, frame: Tensor, placed: Tensor | None = None) -> Tensor:
         """PD targets ``[N, nu]`` rad from actions ``[N, nu]``, for reaching frames ``[N]``; within joint range.
+
+        ``placed [N, nu]`` rad, the joint angles each body was placed with, is read by ``action.reference`` ``start``.
 
         With ``action.kind`` ``torque``: torques ``[N, nu]`` N m, within their limits.
         """
         if self.action.kind == "torque":
             share = torch.clamp(self.action.scale * action.to(torch.float64), -1.0, 1.0)
             return share * torch.as_tensor(self.humanoid.torque_limit)
-        base = self._rest if self._table is None else self._table[frame]
+        if self.action.reference == "start":
+            if placed is None:
+                raise ValueError("action.reference=start needs the joint angles the bodies were placed with")
+            base = placed
+        else:
+            base = self._rest if self._table is None else self._table[frame]
         return torch.clamp(base + self.action.scale * action.to(torch.float64), self._range[0], self._range[1])
 
     def observation(self, state: BodyState | BodyView) -> Tensor:

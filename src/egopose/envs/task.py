@@ -67,6 +67,7 @@ class EgoPoseTask(control.Task):
         self.problem, self.starts = problem, starts
         self._generator = torch.Generator().manual_seed(seed)
         self._take, self._start, self._stop, self._frame = (torch.zeros(1, dtype=torch.int64) for _ in range(4))
+        self._placed = torch.zeros(0)
         self.reward_terms: dict[str, float] = {}
 
     def initialize_episode(self, physics: HumanoidPhysics) -> None:
@@ -76,11 +77,12 @@ class EgoPoseTask(control.Task):
         reference = self.problem.reference_at(self._frame)
         physics.data.qpos[:] = reference["qpos"][0].numpy()
         physics.data.qvel[:] = reference["qvel"][0].numpy()
+        self._placed = reference["qpos"][:, 7:]
         physics.diverged = False
 
     def before_step(self, action: NDArray[np.floating] | Tensor, physics: HumanoidPhysics) -> None:
         self._frame = torch.minimum(self._frame + 1, self._stop - 1)
-        target = self.problem.target(torch.as_tensor(np.asarray(action))[None], self._frame)
+        target = self.problem.target(torch.as_tensor(np.asarray(action))[None], self._frame, self._placed)
         physics.set_control(target[0].numpy())
 
     def action_spec(self, physics: HumanoidPhysics) -> specs.BoundedArray:

@@ -41,5 +41,7 @@ class TransformedEgoPoseEnv(TransformedEnv):
             fresh = self.base_env.begin(worlds)
             fresh = self.transform._reset(fresh.empty(), fresh)
             for key, value in fresh.items(include_nested=True, leaves_only=True):
-                follows.set(key, torch.index_copy(after.get(key), 0, worlds, value))
+                # A hidden state is missing where the actions came from elsewhere.
+                if (before := after.get(key, None)) is not None:
+                    follows.set(key, torch.index_copy(before, 0, worlds, value))
         return tensordict, follows

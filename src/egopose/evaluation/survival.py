@@ -64,7 +64,7 @@ def reference_tracking(env: TransformedEnv) -> Controller:
 
     def track(observation: TensorDictBase) -> TensorDictBase:
         frame = torch.minimum(observation["frame"] + 1, observation["episode_stop"] - 1).squeeze(-1)
-        return observation.set("action", action_towards(problem, frame))
+        return observation.set("action", action_towards(problem, frame, base.placed))
 
     return track
 
@@ -79,8 +79,11 @@ def base_tracking(env: TransformedEnv) -> Controller:
     return track
 
 
-def action_towards(problem: ImitationProblem, frame: Tensor) -> Tensor:
-    """The action ``[N, nu]`` whose PD target is the reference's joint angles at global frames ``[N]``."""
+def action_towards(problem: ImitationProblem, frame: Tensor, placed: Tensor | None = None) -> Tensor:
+    """The action ``[N, nu]`` whose PD target is the reference's joint angles at global frames ``[N]``.
+
+    ``placed``: see :meth:`ImitationProblem.target`.
+    """
     nothing = torch.zeros(len(frame), problem.humanoid.mj_model.nu)
     wanted = problem.reference_at(frame)["qpos"][:, 7:]
-    return ((wanted - problem.target(nothing, frame)) / problem.action.scale).float()
+    return ((wanted - problem.target(nothing, frame, placed)) / problem.action.scale).float()
