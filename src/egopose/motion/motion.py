@@ -9,6 +9,7 @@ import numpy as np
 from scipy.spatial.transform import Slerp
 
 from egopose.motion import rotations as rot
+from egopose.motion.ground_reaction import GroundReaction
 from egopose.motion.kinematics import forward_kinematics
 from egopose.motion.rotations import Array
 from egopose.motion.skeleton import Skeleton
@@ -25,6 +26,7 @@ class Motion:
         name: of the take.
         contacts: ``[T, k]`` booleans per contact point, or None; ``contact_names`` says which.
         torques: ``[T, nv - 6]`` N m per hinge, or None.
+        ground_reaction: forces of the ground, or None.
         meta: where it comes from (JSON-like values only): source, units, up axis, licence.
 
     Raises:
@@ -38,6 +40,7 @@ class Motion:
     contacts: np.ndarray | None = None
     contact_names: tuple[str, ...] = ()
     torques: Array | None = None
+    ground_reaction: GroundReaction | None = None
     meta: dict[str, Any] = field(default_factory=dict, compare=False)
 
     def __post_init__(self) -> None:
@@ -51,7 +54,8 @@ class Motion:
             raise ValueError(f"qpos is not finite at frame {int(np.argwhere(~np.isfinite(qpos))[0, 0])}")
         if not self.fps > 0:
             raise ValueError(f"fps must be positive, got {self.fps}")
-        for label, extra in (("contacts", self.contacts), ("torques", self.torques)):
+        for label in ("contacts", "torques", "ground_reaction"):
+            extra = getattr(self, label)
             if extra is not None and len(extra) != len(qpos):
                 raise ValueError(f"{label} have {len(extra)} frames, qpos has {len(qpos)}")
 
@@ -79,12 +83,13 @@ class Motion:
             qpos=self.qpos[part],
             contacts=None if self.contacts is None else self.contacts[part],
             torques=None if self.torques is None else self.torques[part],
+            ground_reaction=None if self.ground_reaction is None else self.ground_reaction.at(part),
         )
 
     def resample(self, fps: float) -> Motion:
         """The same motion at another rate, from the first frame on: slerp for the root, linear for the rest.
 
-        Contacts take the nearest frame. The last sample is the last that lies inside the clip.
+        Contacts and forces of the ground take the nearest frame. The last sample is the last that lies inside the clip.
         """
         if abs(fps - self.fps) < 1e-9 or len(self) == 1:
             return replace(self, fps=fps)
@@ -107,6 +112,7 @@ class Motion:
             fps=fps,
             contacts=None if self.contacts is None else self.contacts[nearest],
             torques=None if self.torques is None else (1 - weight) * self.torques[low] + weight * self.torques[low + 1],
+            ground_reaction=None if self.ground_reaction is None else self.ground_reaction.at(nearest),
         )
 
 

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from egopose.errors import InputError
+from egopose.motion.ground_reaction import GroundReaction
 from egopose.motion.io._files import MAX_JOINTS
 from egopose.motion.io._npz import read_arrays
 from egopose.motion.motion import Motion
@@ -23,14 +24,17 @@ _MAX_VALUE = 1e7
 #: Three slides and three hinges, as the project's own readers make them at most; tips beyond any mesh's.
 _MAX_DOFS, _MAX_TIPS = 6, 256
 
+_GROUND = ("force", "point", "moment")
+
 FORMAT, VERSION = "egopose.motion", 1
 
 
 def write_native(motion: Motion, path: str | Path, *, dtype: str = "float64") -> None:
     """Write a clip; ``dtype="float32"`` halves it at about 1e-7 of each value.
 
-    Arrays: ``header`` (UTF-8 JSON as uint8: format, version, name, fps, skeleton, contact names, meta), ``qpos
-    [T, nq]``, and ``contacts [T, k]``, ``torques [T, nv - 6]`` where the motion has them.
+    Arrays: ``header`` (UTF-8 JSON as uint8: format, version, name, fps, skeleton, contact names, names of the bodies
+    on the ground, meta), ``qpos [T, nq]``, and ``contacts [T, k]``, ``torques [T, nv - 6]``, ``ground_force``,
+    ``ground_point``, ``ground_moment [T, b, 3]`` where the motion has them.
 
     Raises:
         ValueError: another ``dtype``, or ``meta`` that JSON cannot say.
@@ -44,6 +48,7 @@ def write_native(motion: Motion, path: str | Path, *, dtype: str = "float64") ->
         "fps": motion.fps,
         "skeleton": skeleton_to_json(motion.skeleton),
         "contact_names": list(motion.contact_names),
+        "ground_bodies": [] if motion.ground_reaction is None else list(motion.ground_reaction.bodies),
         "meta": motion.meta,
     }
     try:
@@ -55,6 +60,9 @@ def write_native(motion: Motion, path: str | Path, *, dtype: str = "float64") ->
         arrays["contacts"] = np.asarray(motion.contacts, dtype=bool)
     if motion.torques is not None:
         arrays["torques"] = np.asarray(motion.torques, dtype=dtype)
+    if motion.ground_reaction is not None:
+        for label in _GROUND:
+            arrays[f"ground_{label}"] = getattr(motion.ground_reaction, label).astype(dtype)
     with Path(path).open("wb") as stream:
         np.savez_compressed(stream, **arrays)  # type: ignore[arg-type]  # the stub takes allow_pickle for an array
 
@@ -66,7 +74,7 @@ def read_native(path: str | Path) -> Motion:
         InputError: names the file, the field of the header or the array, and the cause.
     """
     path = Path(path)
-    arrays = read_arrays(path, ("header", "qpos", "contacts", "torques"))
+    arrays = read_arrays(path, ("header", "qpos", "contacts", "torques", *(f"ground_{label}" for label in _GROUND)))
     if "header" not in arrays or arrays["header"].dtype != np.uint8 or arrays["header"].ndim != 1:
         raise InputError(path, "header", "missing or not bytes: not a clip of this project")
     if len(arrays["header"]) > _MAX_HEADER:
@@ -82,15 +90,16 @@ def read_native(path: str | Path) -> Motion:
     qpos = arrays.get("qpos")
     if qpos is None or qpos.dtype not in (np.float32, np.float64):
         raise InputError(path, "qpos", "missing or not float32 or float64")
-    for label, kind in (("contacts", "b"), ("torques", "f")):
-        if label in arrays and (arrays[label].dtype.kind != kind or arrays[label].ndim != 2):
+    expected = {"contacts": ("b", 2), "torques": ("f", 2), **{f"ground_{label}": ("f", 3) for label in _GROUND}}
+    for label, (kind, axes) in expected.items():
+        if label in arrays and (arrays[label].dtype.kind != kind or arrays[label].ndim != axes):
             raise InputError(path, label, f"wrong type or shape: {arrays[label].dtype} {arrays[label].shape}")
     skeleton = _checked(path, "header.skeleton", lambda: skeleton_from_json(header["skeleton"]))
     if "torques" in arrays and arrays["torques"].shape[1] != skeleton.n_dofs:
         raise InputError(
             path, "torques", f"{arrays['torques'].shape[1]} columns for {skeleton.n_dofs} degrees of freedom"
         )
-    for label in {"qpos", "torques"} & set(arrays):
+    for label in sorted({"qpos", "torques", *(f"ground_{label}" for label in _GROUND)} & set(arrays)):
         bad = ~(np.abs(arrays[label]) < _MAX_VALUE).reshape(len(arrays[label]), -1).all(axis=1)
         if bad.any():
             raise InputError(path, label, f"frame {int(np.argmax(bad))} is not finite or absurdly large")
@@ -114,9 +123,21 @@ def read_native(path: str | Path) -> Motion:
             contacts=arrays.get("contacts"),
             contact_names=tuple(str(n) for n in header["contact_names"]),
             torques=None if torques is None else torques.astype(np.float64),
+            ground_reaction=_ground_reaction(arrays, header),
             meta=meta,
         ),
     )
+
+
+def _ground_reaction(arrays: dict[str, np.ndarray], header: dict[str, Any]) -> GroundReaction | None:
+    """Raises ValueError where an array is missing or of another shape."""
+    there = [f"ground_{label}" for label in _GROUND if f"ground_{label}" in arrays]
+    if not there:
+        return None
+    if len(there) < len(_GROUND):
+        raise ValueError(f"of the ground's arrays only {', '.join(there)} are there")
+    bodies = tuple(str(name) for name in header["ground_bodies"])
+    return GroundReaction(bodies, *(arrays[name] for name in there))
 
 
 def skeleton_to_json(skeleton: Skeleton) -> dict[str, Any]:
