@@ -14,16 +14,35 @@ from egopose.errors import InputError
 from egopose.motion.io._npz import entry_names
 from egopose.motion.io.acclaim import read_amc
 from egopose.motion.io.amass import read_amass
+from egopose.motion.io.amass_writer import write_amass
 from egopose.motion.io.bvh import read_bvh
 from egopose.motion.io.bvh_writer import write_bvh
+from egopose.motion.io.c3d import write_c3d
+from egopose.motion.io.csv_table import write_csv
 from egopose.motion.io.deepmimic import read_deepmimic
+from egopose.motion.io.glb import write_glb
+from egopose.motion.io.mot import write_forces_mot, write_mot, write_torques_sto
 from egopose.motion.io.native import read_native, write_native
+from egopose.motion.io.trc import write_trc
 from egopose.motion.motion import Motion
 
-__all__ = ["read_motion", "write_motion"]
+__all__ = ["WRITERS", "read_motion", "write_motion", "writer_suffix"]
 
 _READERS: dict[str, Callable[..., Motion]] = {".bvh": read_bvh, ".amc": read_amc, ".txt": read_deepmimic}
-_WRITERS: dict[str, Callable[..., None]] = {".bvh": write_bvh, ".npz": write_native}
+
+#: How files of each ending are written; of two endings that fit a name the longer one counts.
+WRITERS: dict[str, Callable[..., None]] = {
+    ".bvh": write_bvh,
+    ".glb": write_glb,
+    ".amass.npz": write_amass,
+    ".trc": write_trc,
+    ".c3d": write_c3d,
+    ".mot": write_mot,
+    ".forces.mot": write_forces_mot,
+    ".torques.sto": write_torques_sto,
+    ".csv": write_csv,
+    ".npz": write_native,
+}
 
 
 def read_motion(path: str | Path, **options: Any) -> Motion:
@@ -49,18 +68,31 @@ def read_motion(path: str | Path, **options: Any) -> Motion:
 
 
 def write_motion(motion: Motion, path: str | Path, **options: Any) -> None:
-    """Write a motion: ``.bvh`` (options ``unit``, ``up``) or the project's own ``.npz`` (option ``dtype``).
+    """Write a motion; the ending says how: one of :data:`WRITERS`, each with the keyword options of its function.
+
+    ``.npz`` is the project's own clip (option ``dtype``); all others are for other programs, see
+    docs/howto-export.md.
 
     Raises:
-        InputError: an unknown suffix or option, a folder that is not there.
+        InputError: an unknown ending or option, a folder that is not there, a motion that the format cannot hold.
     """
     path = Path(path)
-    writer = _WRITERS.get(path.suffix.lower())
-    if writer is None:
-        raise InputError(path, "suffix", f"no writer for {path.suffix!r}; there is one for {', '.join(_WRITERS)}")
+    writer = WRITERS[writer_suffix(path)]
     if not path.parent.is_dir():
         raise InputError(path, "path", f"no folder {path.parent}")
     _call(writer, path, options, motion, path)
+
+
+def writer_suffix(path: Path) -> str:
+    """The key of :data:`WRITERS` a file's name ends with, the longest that fits.
+
+    Raises:
+        InputError: there is none.
+    """
+    fitting = [suffix for suffix in WRITERS if path.name.lower().endswith(suffix)]
+    if not fitting:
+        raise InputError(path, "suffix", f"no writer for {path.suffix!r}; there is one for {', '.join(WRITERS)}")
+    return max(fitting, key=len)
 
 
 def _call(function: Callable[..., Any], path: Path, options: dict[str, Any], *arguments: Any) -> Any:

@@ -47,6 +47,11 @@ _BODY = (
     ("right_wrist", "right_elbow", (-0.25, 0.01, 0.0), "zxy"),
 )
 _NAMES = [row[0] for row in _BODY]
+
+#: The 22 joints in the files' order, and each one's parent among them (-1 for the pelvis).
+BODY_JOINTS = tuple(_NAMES)
+BODY_PARENTS = tuple(_NAMES.index(row[1]) if row[1] else -1 for row in _BODY)
+
 _TIPS = {
     "head": ((0.0, 0.16, 0.02),),
     "left_foot": ((0.0, 0.0, 0.07),),
@@ -85,7 +90,7 @@ def read_amass(path: str | Path, *, joints: ArrayLike | None = None) -> Motion:
         raise InputError(path, "poses", f"{poses.shape[1]} columns; known are {', '.join(map(str, _WIDTHS))}")
     if trans.shape != (len(poses), 3):
         raise InputError(path, "trans", f"shape {trans.shape}, poses have {len(poses)} frames")
-    rest = _rest_positions() if joints is None else np.asarray(joints, dtype=np.float64)
+    rest = rest_positions() if joints is None else np.asarray(joints, dtype=np.float64)
     if rest.shape != (len(_BODY), 3) or not np.isfinite(rest).all():
         raise InputError(path, "option joints", f"must be [{len(_BODY)}, 3] finite positions, got {rest.shape}")
     skeleton = _skeleton(rest)
@@ -116,7 +121,8 @@ def _rate(path: Path, arrays: dict[str, np.ndarray]) -> float:
     raise InputError(path, _RATES[0], "missing: the frame rate is not said")
 
 
-def _rest_positions() -> Array:
+def rest_positions() -> Array:
+    """``[22, 3]`` m: the plain adult's joints in the T-pose, y up."""
     positions = np.zeros((len(_BODY), 3))
     for i, (_, parent, offset, _) in enumerate(_BODY):
         positions[i] = np.array(offset) + (positions[_NAMES.index(parent)] if parent else 0.0)
