@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from torch import nn
+from torch import Tensor, nn
 
 from egopose.data.preparation import flow_name, global_spans, store_folder
 from egopose.data.splits import split_takes
@@ -216,37 +216,26 @@ def _placed(states: Array, material: Material, rows: slice, name: str) -> Motion
 
 
 def forecast_qpos(
-    model: RecurrentForecaster, material: Material, windows: Sequence[ForecastWindow], batch: int = 64
+    model: RecurrentForecaster, contexts: Tensor, material: Material, windows: Sequence[ForecastWindow]
 ) -> Array:
-    """The futures ``[W, H, nq]`` of windows, begun from PoseReg's poses of their contexts; roots integrated.
+    """The futures ``[W, H, nq]`` of windows, from PoseReg's poses of the frames seen; roots integrated from there.
 
     Args:
         model: trained.
-        material: with the state regressor's states.
+        contexts: ``[W, context, S]`` humanoid states z, see :func:`egopose.inference.context_states.context_states`.
+        material: for where the windows begin.
         windows: all of one context and horizon.
-        batch: windows at a time.
-
-    Raises:
-        InputError: there are no regressed states.
     """
-    if material.states is None:
-        raise InputError(
-            "baseline", "regressor", "forecasts begin from the state regressor's poses, and there are none"
-        )
     humanoid, size = material.humanoid, len(model.mean)
     fps, out = 1.0 / humanoid.control_dt, []
-    for at in range(0, len(windows), batch):
-        part = windows[at : at + batch]
-        context = torch.stack([material.states[_rows(material, w)][: w.context, :size] for w in part])
-        futures = model.forecast(context, part[0].horizon)
-        for window, seen, future in zip(part, context, futures, strict=True):
-            poses = torch.cat([seen, future]).double().numpy()
-            # The joint velocities, which neither integration nor qpos reads.
-            states = np.concatenate([poses, np.zeros((len(poses), size - 11))], axis=1)
-            rows = _rows(material, window)
-            first: Array = torch.as_tensor(material.reference["qpos"][rows.start]).double().numpy()
-            parts = split_state(states, humanoid.joint_range)
-            position, heading = integrate_root(parts, first[:2], rot.heading(first[3:7]), fps)
-            qpos, _ = state_to_qpos(states, position, heading, humanoid.joint_range)
-            out.append(qpos[window.context :])
+    poses = contexts[:, :, :size].float()
+    futures = torch.cat([model.forecast(part, windows[0].horizon) for part in poses.split(64)])
+    for window, clip in zip(windows, torch.cat([poses, futures], dim=1).double().numpy(), strict=True):
+        # Neither the integration nor qpos reads joint velocities.
+        states = np.concatenate([clip, np.zeros((len(clip), contexts.shape[-1] - size))], axis=1)
+        first: Array = torch.as_tensor(material.reference["qpos"][_rows(material, window).start]).double().numpy()
+        parts = split_state(states, humanoid.joint_range)
+        position, heading = integrate_root(parts, first[:2], rot.heading(first[3:7]), fps)
+        qpos, _ = state_to_qpos(states, position, heading, humanoid.joint_range)
+        out.append(qpos[window.context :])
     return np.stack(out)

@@ -1,0 +1,190 @@
+"""One job of the study: its run trained as far as that is to be done, judged, its raw result written."""
+
+from __future__ import annotations
+
+import json
+import os
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+from study import Job
+
+from egopose.baseline import run_baseline_job
+from egopose.baselines import forecast_qpos, load_baseline, path_pose_motion, regressed_motion
+from egopose.config import compose_config, from_mapping
+from egopose.data.preparation import flow_name, store_folder
+from egopose.data.store import TakeStore
+from egopose.evaluation.agents import evaluate_agent
+from egopose.evaluation.forecasting import ForecastWindow, forecast_windows, score_forecasts, true_futures
+from egopose.evaluation.protocols import METRICS, ContactSettings, TakeScores, score_take
+from egopose.evaluation.tables import write_json
+from egopose.forecast_evaluation import ForecastSettings, forecast_windows_of, start_states, windows_of
+from egopose.inference.context_states import context_states
+from egopose.inference.failsafe import FailSafeSettings
+from egopose.material import Material, absolute_paths, load_material, run_material
+from egopose.models.baselines.path_pose import PathPose
+from egopose.models.baselines.recurrent import RecurrentForecaster
+from egopose.motion.rotations import Array
+from egopose.pipeline import load_agent
+from egopose.regression import load_regressor
+from egopose.train import run_job as train_job
+from egopose.training.logging import write_provenance
+
+Result = dict[str, Any]
+
+
+def run_job(job: Job, runs: Path, results: Path, machine: Sequence[str]) -> None:
+    """Train what is left to train, judge, write ``job.raw(results)`` whole or not at all.
+
+    Args:
+        job: which.
+        runs: where run directories and the folds' own stores lie.
+        results: where raw results go.
+        machine: overrides for what differs between machines.
+
+    Raises:
+        InputError: settings or data do not fit.
+        SystemExit: 130, training was interrupted; it goes on the next time.
+    """
+    begun = time.monotonic()
+    folder = runs / job.run
+    name = "baseline" if job.verb == "baseline" else "train"
+    config = _config(name, [*job.overrides, *machine], job.store, runs)
+    if job.verb == "train":
+        train_job(config, folder)
+    elif job.verb == "baseline":
+        run_baseline_job(config, folder)
+    else:
+        write_provenance(folder, config)
+        material = load_material(config)
+        material.keep_regressor(folder)
+        material.keep_provenance(folder)
+    judged = config
+    if job.evaluate:
+        judged = _config(name, [*job.overrides, *job.evaluate, *machine], job.evaluate_store, runs)
+    settings = compose_config("evaluate", ["checkpoint=none", *job.settings])
+    result = (_forecasts if job.task == "forecasting" else _estimates)(job, folder, config, judged, settings)
+    path = job.raw(results)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    about = {
+        "fingerprint": job.fingerprint,
+        **{key: getattr(job, key) for key in ("table", "method", "protocol", "fold", "seed", "task", "settings")},
+        "overrides": [*job.overrides, *job.evaluate],
+        "training": _training(folder),
+        "versions": json.loads((folder / "versions.json").read_text()),
+        "seconds_of_last_start": round(time.monotonic() - begun, 1),
+    }
+    part = path.with_suffix(".part")
+    write_json(part, {**about, **result})
+    os.replace(part, path)
+
+
+def _config(name: str, overrides: Sequence[str], store: str, runs: Path) -> dict[str, Any]:
+    own = [f"data.store={runs / 'stores' / store}"] if store else []
+    return absolute_paths(compose_config(name, [*overrides, *own]))
+
+
+def _training(folder: Path) -> Result | None:
+    path = folder / "finished.json"
+    return json.loads(path.read_text()) if path.is_file() else None
+
+
+def _material(folder: Path, config: dict[str, Any], judged: dict[str, Any]) -> Material:
+    return run_material(judged, folder, same_store=judged is config)
+
+
+def _labels(config: dict[str, Any], fragments: Sequence[Any]) -> list[str]:
+    takes = TakeStore.open(store_folder(config)).takes
+    return [f"{takes[f.take].name}_{f.start}-{f.stop}" for f in fragments]
+
+
+def _estimates(
+    job: Job, folder: Path, config: dict[str, Any], judged: dict[str, Any], settings: dict[str, Any]
+) -> Result:
+    """Figures of every held-out fragment: ``figures[metric][take]`` in the units of METRICS, ``resets[take]``."""
+    contact = from_mapping(ContactSettings, settings["contact"], "conf/evaluate.yaml: contact")
+    if job.verb == "train":
+        other = {} if judged is config else {key: judged[key] for key in ("data", "vision")}
+        # Not the best: which that is, is decided on test fragments while training.
+        agent = load_agent(folder, which="latest", overrides=other)
+        fragments = list(agent.material.test)
+        labels = _labels(judged, fragments)
+        failsafe = from_mapping(FailSafeSettings, settings["failsafe"], "conf/evaluate.yaml: failsafe")
+        found = evaluate_agent(agent, fragments, labels, "test", failsafe, contact, int(settings["threads"]))
+        diverged = sum(one.estimate.diverged for one in found)
+        return _figures([one.scores for one in found]) | {"diverged": int(diverged)}
+    material = _material(folder, config, judged)
+    fragments = list(material.test)
+    labels = _labels(judged, fragments)
+    if job.verb == "regressor":
+        motions = [regressed_motion(material, f, label) for f, label in zip(fragments, labels, strict=True)]
+    else:
+        model = load_baseline(folder).model
+        assert isinstance(model, PathPose), f"{job.method} estimates nothing"
+        flow = TakeStore.open(store_folder(judged)).flow(flow_name(judged))
+        motions = [
+            path_pose_motion(model, flow, material, f, label) for f, label in zip(fragments, labels, strict=True)
+        ]
+    truth, offsets = torch.as_tensor(material.reference["qpos"]).double().numpy(), material.takes.offsets.tolist()
+    scores = []
+    for fragment, motion in zip(fragments, motions, strict=True):
+        first = offsets[fragment.take] + fragment.start
+        reference = truth[first : first + len(motion)]
+        scores.append(score_take(motion.name, motion.qpos, reference, material.humanoid, contact))
+    return _figures(scores)
+
+
+def _figures(scores: Sequence[TakeScores]) -> Result:
+    return {
+        "takes": [one.name for one in scores],
+        "figures": {m.key: [m.scale * one.figure(m.key) for one in scores] for m in METRICS},
+        "resets": [one.resets for one in scores],
+        "frames": [len(one.frames["E_pose"]) for one in scores],
+    }
+
+
+def _forecasts(
+    job: Job, folder: Path, config: dict[str, Any], judged: dict[str, Any], settings: dict[str, Any]
+) -> Result:
+    """Figures of every held-out take by horizon: ``figures[metric][take][horizon]``, ``horizons`` in seconds."""
+    forecast = from_mapping(ForecastSettings, settings["forecast"], "conf/evaluate.yaml: forecast")
+    if job.verb == "train":
+        agent = load_agent(folder, which="latest")
+        material = agent.material
+        windows = windows_of(agent, "test", forecast)
+        states = start_states(agent, windows, forecast)
+        futures = forecast_windows_of(agent, windows, states, 1, forecast, int(settings["threads"])).qpos
+    else:
+        material = _material(folder, config, judged)
+        baseline = load_baseline(folder)
+        assert isinstance(baseline.model, RecurrentForecaster), f"{job.method} forecasts nothing"
+        made = baseline.settings
+        windows = forecast_windows(material.test, made.context, forecast.horizon or made.horizon, forecast.every)
+        futures = forecast_qpos(baseline.model, _contexts(material, judged, windows), material, windows)[:, None]
+    truth = _truth(material, windows)
+    hands = [int(d) for d in material.humanoid.hand_dofs]
+    scores = score_forecasts(truth, windows, futures, hands, 1.0 / material.humanoid.control_dt)
+    takes = TakeStore.open(store_folder(judged)).takes
+    return {
+        "takes": [takes[number].name for number in sorted({w.take for w in windows})],
+        "windows": len(windows),
+        "horizons": scores.horizons.tolist(),
+        "figures": {metric: scores.per_take(metric).tolist() for metric in scores.mean},
+    }
+
+
+def _contexts(material: Material, config: dict[str, Any], windows: Sequence[ForecastWindow]) -> torch.Tensor:
+    """``[W, context, S]``: what the state regressor sees in the frames of each context alone."""
+    assert material.regressor is not None
+    model, _ = load_regressor(material.regressor)
+    flow = TakeStore.open(store_folder(config)).flow(flow_name(config))
+    first = [int(material.takes.offsets[w.take]) + w.start for w in windows]
+    return context_states(model, flow, first, windows[0].context)
+
+
+def _truth(material: Material, windows: Sequence[ForecastWindow]) -> Array:
+    reference = torch.as_tensor(material.reference["qpos"]).double().numpy()
+    return true_futures(reference, material.takes.offsets.tolist(), windows)
