@@ -15,7 +15,7 @@ from toy_problem import COLLECTOR, LOOP, SETTINGS
 from egopose import pipeline
 from egopose.config import from_mapping
 from egopose.errors import InputError
-from egopose.estimate import estimate_video, video_material
+from egopose.estimate import estimate_video, seen_in, video_material
 from egopose.humanoid.config import HumanoidConfig, SimConfig
 from egopose.humanoid.model import build_humanoid
 from egopose.motion.io import read_motion
@@ -62,7 +62,8 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     weights = {"regressor": regressor, "config": {"state_size": size, **config}}
     RunCheckpoint(weights).save(folder / "regressor", metadata=metadata_of("regressor", size, 1, 0, 0.0))
     flow = np.zeros((FRAMES, 2, 32, 32), np.float16)
-    material, _ = video_material(humanoid, regressor.eval(), flow, 64, "nothing")
+    seen = seen_in(humanoid, regressor.eval(), flow, config)
+    material, _ = video_material(humanoid, seen, "nothing")
     made = pipeline.build_run(config, folder, material)
     made.save()
     made.collector.shutdown()
@@ -72,6 +73,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def settings(video: Path, checkpoint: Path, **changed: Any) -> dict[str, Any]:
     failsafe = {"mode": "value", "kappa": 0.6, "fallen_height": 0.3}
     values = {"which": "latest", "out": None, "offset": 0.0, "size": 64, "failsafe": failsafe}
+    values |= {"causal": False, "lookahead": 10}
     return {"video": str(video), "checkpoint": str(checkpoint), **values, **changed}
 
 

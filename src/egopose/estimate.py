@@ -18,22 +18,95 @@ from egopose.errors import InputError  # noqa: E402
 
 if TYPE_CHECKING:
     import numpy as np
+    from torch import Tensor
 
     from egopose.humanoid.model import HumanoidModel
+    from egopose.inference.causal import CausalRegression
     from egopose.material import Material
     from egopose.models.regressor import StateRegressor
     from egopose.motion.motion import Motion
     from egopose.pipeline import Agent
 
 
-def video_material(
+def causal_regression(
     humanoid: HumanoidModel,
     regressor: StateRegressor,
-    flow: np.ndarray,
     made_with: Mapping[str, Any],
-    name: str,
-    lookahead: int | None = None,
-) -> tuple[Material, Motion]:
+    task: Mapping[str, Any],
+    lookahead: int,
+) -> CausalRegression:
+    """The regressor that sees ``lookahead`` frames ahead and no more, for a policy of the group ``task``.
+
+    Args:
+        humanoid: the run's.
+        regressor: trained, in eval mode.
+        made_with: the groups ``vision`` and ``regressor`` it was trained with.
+        task: the run's.
+        lookahead: frames.
+    """
+    import torch
+
+    from egopose.inference.causal import CausalRegression
+
+    smoothing = float(task["action"].get("smoothing", 0.0)) / humanoid.control_dt
+    joint_range = torch.as_tensor(humanoid.joint_range)
+    return CausalRegression(regressor, joint_range, lookahead, _crossed(made_with), smoothing)
+
+
+def _crossed(made_with: Mapping[str, Any]) -> bool:
+    """A policy trained on the tables of several fits reads the regressor's states for a context."""
+    return int(made_with["regressor"]["cross_fit"]) > 1
+
+
+def seen_in(
+    humanoid: HumanoidModel, regressor: StateRegressor, flow: np.ndarray, made_with: Mapping[str, Any]
+) -> dict[str, Tensor]:
+    """What the regressor makes of a whole video.
+
+    Args:
+        humanoid: the run's.
+        regressor: trained, in eval mode.
+        flow: ``[T, 2, S, S]`` of the video at the control rate.
+        made_with: the groups ``vision`` and ``regressor`` it was trained with.
+
+    Returns:
+        ``visual_features [T, D]``, ``visual_context [T, C]`` as a policy reads it, ``humanoid_state [T, S]``,
+        ``joint_targets [T, nu]`` rad.
+    """
+    import torch
+
+    from egopose.regression import joint_targets
+    from egopose.training.fragments import Span
+    from egopose.training.predictions import predict_span
+
+    batch = int(made_with["vision"]["encode_batch"])
+    seen = predict_span(regressor, torch.from_numpy(flow), Span(0, len(flow)), batch)
+    states = seen["humanoid_state"]
+    return {
+        "visual_features": seen["visual_features"],
+        "visual_context": regressor.normalise(states) if _crossed(made_with) else seen["visual_context"],
+        "humanoid_state": states,
+        "joint_targets": joint_targets(states, humanoid),
+    }
+
+
+def seen_live(
+    causal: CausalRegression, regressor: StateRegressor, flow: np.ndarray, made_with: Mapping[str, Any]
+) -> dict[str, Tensor]:
+    """As :func:`seen_in`, each frame as it would have been seen live; smoothed where the policy follows that."""
+    import torch
+
+    from egopose.vision.features import encode
+
+    encoder, batch = regressor.encoder, int(made_with["vision"]["encode_batch"])
+    features = encode(encoder, flow, batch)  # type: ignore[arg-type]  # a regressor of video has a FlowEncoder
+    found = [causal.push(frame, row) for frame, row in enumerate(features)]
+    rows = [*(row for row in found if row is not None), *causal.drain()]
+    keys = ("visual_context", "humanoid_state", "joint_targets")
+    return {"visual_features": features, **{key: torch.stack([getattr(row, key) for row in rows]) for key in keys}}
+
+
+def video_material(humanoid: HumanoidModel, seen: Mapping[str, Tensor], name: str) -> tuple[Material, Motion]:
     """What the policy needs of a video: a take whose reference is what the state regressor makes of it by itself.
 
     There is no mocap. PoseReg's motion, from the origin and heading along x, stands in its place: it gives the policy
@@ -41,11 +114,8 @@ def video_material(
 
     Args:
         humanoid: the run's.
-        regressor: trained, in eval mode.
-        flow: ``[T, 2, S, S]`` of the video at the control rate.
-        made_with: the groups ``vision`` and ``regressor`` it was trained with.
+        seen: of T frames, see :func:`seen_in`.
         name: of the take.
-        lookahead: future frames that each frame's context may see; None for the whole video.
 
     Returns:
         The material and PoseReg's motion.
@@ -61,15 +131,10 @@ def video_material(
     from egopose.envs.problem import TakeTable
     from egopose.material import Material
     from egopose.models.pose_regression import pose_regression
-    from egopose.regression import joint_targets
-    from egopose.training.fragments import Span
-    from egopose.training.predictions import predict_span
 
-    frames = len(flow)
+    frames = len(seen["humanoid_state"])
     if frames < 2:
         raise InputError(name, "video", f"has {frames} frames at 30 frames/s; at least 2 are needed")
-    batch = int(made_with["vision"]["encode_batch"])
-    seen = predict_span(regressor, torch.from_numpy(flow), Span(0, frames), batch, lookahead)
     states = seen["humanoid_state"].numpy()
     facing = np.array([1.0, 0.0, 0.0, 0.0])
     motion = pose_regression(
@@ -78,9 +143,6 @@ def video_material(
     reference = reference_states(humanoid, motion)
     lowest = reference["xpos"][:, humanoid.head, 2].min().reshape(1)
     whole = [Fragment(0, 0, frames)]
-    # A policy trained on the tables of several fits reads the regressor's states for a context.
-    crossed = int(made_with["regressor"]["cross_fit"]) > 1
-    context = regressor.normalise(seen["humanoid_state"]) if crossed else seen["visual_context"]
     material = Material(
         humanoid,
         reference,
@@ -88,8 +150,8 @@ def video_material(
         train=whole,
         test=whole,
         visual_features=seen["visual_features"],
-        visual_context=context,
-        joint_targets=joint_targets(seen["humanoid_state"], humanoid),
+        visual_context=seen["visual_context"],
+        joint_targets=seen["joint_targets"],
         states=seen["humanoid_state"],
     )
     return material, motion
@@ -180,8 +242,17 @@ def estimate_video(values: Mapping[str, Any]) -> Path:
     regressor, made_with = load_regressor(run_folder(checkpoint) / "regressor")
     lookahead = allowed_lookahead(values)
     flow = extract_flow(video, made_with["vision"]["flow"], 1.0 / humanoid.control_dt, float(values["offset"]))
-    material, pose_motion = video_material(humanoid, regressor, flow, made_with, video.stem, lookahead)
-    return run_estimate(values, load_agent(checkpoint, material), pose_motion, video, out)
+    overrides = None
+    if lookahead is None:
+        seen = seen_in(humanoid, regressor, flow, made_with)
+    else:
+        causal = causal_regression(humanoid, regressor, made_with, run["task"], lookahead)
+        seen = seen_live(causal, regressor, flow, made_with)
+        # What is seen live is smoothed already.
+        overrides = {"task": {**run["task"], "action": {**run["task"]["action"], "smoothing": 0.0}}}
+    material, pose_motion = video_material(humanoid, seen, video.stem)
+    agent = load_agent(checkpoint, material, overrides=overrides)
+    return run_estimate(values, agent, pose_motion, video, out)
 
 
 @command("estimate")

@@ -83,10 +83,11 @@ def estimate_takes(
     critic: Controller,
     states: Tensor,
     guard: FailSafe,
+    lookahead: int | None = None,
 ) -> list[Estimate]:
     """Run every world's fragment from its first frame to its last.
 
-    The normaliser is frozen and the context networks see the take to its end, both for good.
+    The normaliser is frozen and the context networks see the take as far as ``lookahead`` lets them, both for good.
 
     Args:
         env: over :class:`EgoPoseEnv` with ``WholeFragments`` starts and falls that do not end the episode; world i's
@@ -94,13 +95,15 @@ def estimate_takes(
         actor, critic: policy and value network.
         states: ``[F, 2 nq - 3]`` the regressor's humanoid state of every global frame.
         guard: the fail-safe, of as many worlds.
+        lookahead: future frames that trainable contexts may see; None for the whole take. ``states`` and contexts that
+            come with the observation are the caller's.
 
     Returns:
         One :class:`Estimate` a world; fragments may differ in length.
     """
     base = env.base_env
     assert isinstance(base, EgoPoseEnv)
-    prepare_for_test(env, actor, critic)
+    prepare_for_test(env, actor, critic, lookahead=lookahead)
     first = env.reset()
     start, stop = first["episode_start"].squeeze(-1), first["episode_stop"].squeeze(-1)
     lengths = stop - start
@@ -145,8 +148,9 @@ def estimate_takes(
     ]
 
 
-def prepare_for_test(env: TransformedEnv, *controllers: Controller) -> None:
-    """Freeze the state normaliser and let trainable contexts see a take to its end in one pass."""
+def prepare_for_test(env: TransformedEnv, *controllers: Controller, lookahead: int | None = None) -> None:
+    """Freeze the state normaliser and let trainable contexts see a take in one pass: each frame's to the take's end, or
+    ``lookahead`` frames ahead and no more."""
     for module in env.transform.modules():
         if isinstance(module, StateNormalizer):
             module.freeze()
@@ -156,7 +160,7 @@ def prepare_for_test(env: TransformedEnv, *controllers: Controller) -> None:
         network.eval()
         for module in network.modules():
             if isinstance(module, EpisodeContext):
-                module.horizon = None
+                module.horizon, module.lookahead = None, lookahead
 
 
 def _restart(base: EgoPoseEnv, worlds: Tensor, states: Tensor, qpos: Tensor) -> None:

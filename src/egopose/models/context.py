@@ -99,6 +99,19 @@ class BidirectionalContext(nn.Module):
         back, _ = self.backward_lstm(window.flip(1))
         return torch.cat([ahead[:, -1], back[:, -1]], dim=-1), state
 
+    def causal_window(self, window: Tensor, state: LstmState | None = None) -> tuple[Tensor, LstmState]:
+        """As :meth:`causal_step`, with the contexts of all frames of the window as they appear at its end.
+
+        Returns:
+            Contexts ``[B, W, output_size]`` and the state after the window's first frame.
+        """
+        first, state = self.forward_lstm(window[:, :1], state)
+        ahead = [first]
+        if window.shape[1] > 1:
+            ahead.append(self.forward_lstm(window[:, 1:], state)[0])
+        back, _ = self.backward_lstm(window.flip(1))
+        return torch.cat([torch.cat(ahead, dim=1), back.flip(1)], dim=-1), state
+
 
 class ForwardContext(nn.Module):
     """Forward LSTM whose last output is the context of a whole window: forecasting sees only the past.

@@ -1,0 +1,116 @@
+"""What the state regressor says of each frame when only a few frames after it have been seen.
+
+Frame t's answer has seen the frames up to ``t + lookahead`` and no more (Yuan & Kitani 2019, section 5: 10 frames, a
+fixed latency of 1/3 s): the forward direction is carried on, the backward direction is run anew over the look-ahead.
+The work of a frame does not depend on how many there were.
+
+Runs that follow the regressor smoothed in time (``task.action.smoothing``) get the same Gaussian here, inside the same
+look-ahead: the frames after t count as they appear at ``t + lookahead``, those before as they were given out.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from egopose.models.context import LstmState
+from egopose.models.regressor import StateRegressor
+
+
+@dataclass(frozen=True)
+class Seen:
+    """What is known of a frame once its look-ahead is in.
+
+    Attributes:
+        frame: control frames since the start.
+        window: ``[W, D]`` visual features of this frame and those of its look-ahead.
+        visual_context: ``[C]`` as a policy with a frozen context reads it.
+        humanoid_state: ``[S]`` the regressor's, in its own units.
+        joint_targets: ``[nu]`` rad, its joint angles within the joints' range.
+    """
+
+    frame: int
+    window: Tensor
+    visual_context: Tensor
+    humanoid_state: Tensor
+    joint_targets: Tensor
+
+
+class CausalRegression:
+    """Visual features in, one frame at a time; :class:`Seen` out, ``lookahead`` frames later.
+
+    Args:
+        regressor: trained, in eval mode.
+        joint_range: ``[nu, 2]`` rad.
+        lookahead: frames.
+        context_of_states: policies read the regressor's normalised state for a context (runs on cross-fitted tables).
+        smoothing: standard deviation in frames of the Gaussian over what was seen; 0 for none.
+    """
+
+    def __init__(
+        self,
+        regressor: StateRegressor,
+        joint_range: Tensor,
+        lookahead: int,
+        context_of_states: bool = False,
+        smoothing: float = 0.0,
+    ) -> None:
+        self._regressor, self._lookahead, self._context_of_states = regressor, lookahead, context_of_states
+        self._low, self._high = joint_range.float().T
+        self._state: LstmState | None = None
+        self._weights = _gaussian(smoothing, lookahead) if smoothing > 0 and lookahead > 0 else None
+        #: Frames whose look-ahead is not in, with their features ``[D]``.
+        self.pending: deque[tuple[int, Tensor]] = deque(maxlen=lookahead + 1)
+        #: Rows given out before they were smoothed, as far as smoothing looks back.
+        self.past: deque[Tensor] = deque(maxlen=lookahead if self._weights is not None else 0)
+
+    def push(self, frame: int, features: Tensor) -> Seen | None:
+        """Take in a frame's features ``[D]``; what is now known of the frame ``lookahead`` before it, if there is."""
+        self.pending.append((frame, features))
+        return self._next() if len(self.pending) > self._lookahead else None
+
+    def drain(self) -> Iterator[Seen]:
+        """The last frames, whose look-ahead the end has cut short."""
+        while self.pending:
+            yield self._next()
+
+    @torch.no_grad()
+    def _next(self) -> Seen:
+        window = torch.stack([features for _, features in self.pending])
+        frame, _ = self.pending.popleft()
+        if self._weights is None:
+            context, self._state = self._regressor.context.causal_step(window[None], self._state)
+            row = self._rows(context)[0]
+        else:
+            contexts, self._state = self._regressor.context.causal_window(window[None], self._state)
+            row = self._smooth(self._rows(contexts[0]))
+        states, joints = self._regressor.state_mean.shape[0], self._low.shape[0]
+        state, angles, read = row.split([states, joints, len(row) - states - joints])
+        return Seen(frame, window, read, state, angles)
+
+    def _rows(self, context: Tensor) -> Tensor:
+        """``[W, S + nu + C]``: state, joint targets and what the policy reads, of contexts ``[W, C]``."""
+        states = self._regressor.decode(context) * self._regressor.state_std + self._regressor.state_mean
+        angles = states[:, 5 : 5 + len(self._low)].clamp(self._low, self._high)
+        read = self._regressor.normalise(states) if self._context_of_states else context
+        return torch.cat([states, angles, read], dim=-1)
+
+    def _smooth(self, rows: Tensor) -> Tensor:
+        """The first of ``rows [W, N]`` smoothed over them and the past; beyond either end the outermost row stands."""
+        assert self._weights is not None
+        before = [self.past[0] if self.past else rows[0]] * (self._lookahead - len(self.past)) + list(self.past)
+        after = rows[-1:].expand(self._lookahead + 1 - len(rows), -1)
+        self.past.append(rows[0])
+        table = torch.cat([torch.stack(before), rows, after]).double()
+        return (self._weights @ table).to(rows.dtype)
+
+
+def _gaussian(deviation: float, radius: int) -> Tensor:
+    """``[2 radius + 1]`` float64 weights of sum 1."""
+    weights = [math.exp(-0.5 * (k / deviation) ** 2) for k in range(-radius, radius + 1)]
+    return torch.tensor(weights, dtype=torch.float64) / sum(weights)
