@@ -98,7 +98,12 @@ def test_everything_is_written_and_agrees(agent: pipeline.Agent, tmp_path: Path)
     shortest, *longer = saved["figures"]["ours"]["E_pose"]  # 12 frames: 1/3 s alone
     assert (shortest["runs"], shortest["takes"]) == (2, 2)
     assert longer == [None] * 4
-    assert saved["figures"]["standing still"]["A_accl"][0]["value"] == 0
+    still = saved["figures"]["standing still"]
+    assert still["A_accl"][0]["value"] == 0
+    assert set(saved["ratios"]) == {"standing still"}
+    assert saved["ratios"]["standing still"]["A_accl"] == [None] * 5
+    ratio = saved["ratios"]["standing still"]["E_pose"][0]["value"]
+    assert ratio == pytest.approx(shortest["value"] / still["E_pose"][0]["value"])
     coverage = saved["coverage"][0]
     assert coverage["calibration"] == pytest.approx(0.8, abs=0.02)
     assert coverage["calibration_windows"] == 3

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -234,3 +235,24 @@ def test_actions_may_be_relative_to_the_pose_an_episode_begins_with(material: Ma
     assert torch.equal(again.placed, base.placed)
     with pytest.raises(ValueError, match="placed"):
         base.problem.target(action, base.frame)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="starts processes")
+@pytest.mark.slow
+def test_two_processes_collect_memories_too(material: Material, tmp_path: Path) -> None:
+    config = configuration(iterations=3)
+    config["collector"] = {**config["collector"], "kind": "multi_sync", "workers": 2}
+    run = pipeline.build_run(config, tmp_path, material)
+    try:
+        batches = iter(run.collector)
+        next(batches)
+        run.ppo.update(run.ppo.advantages(next(batches)))
+        run.collector.update_policy_weights_()
+        batch = next(batches)
+        with torch.no_grad(), set_recurrent_mode(True):
+            again = run.ppo.actor.get_dist(batch.select(*run.ppo.actor.in_keys))
+    finally:
+        run.collector.shutdown()
+    # The hidden states a batch begins with come from before the update; all else is the weights sent.
+    torch.testing.assert_close(again.mean, batch["loc"], atol=1e-6, rtol=0)
+    assert (batch["policy_hidden"][:, 0] != 0).any()

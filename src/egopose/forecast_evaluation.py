@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from egopose.baselines import forecast_qpos, load_baseline
 from egopose.config import from_mapping
 from egopose.data.preparation import flow_name, store_folder
 from egopose.data.store import TakeStore
@@ -24,6 +25,7 @@ from egopose.inference.bands import Bands, fit_scale, quantile_bands
 from egopose.inference.context_states import context_states
 from egopose.inference.forecaster import Forecasts, forecast, placed_states
 from egopose.material import Material
+from egopose.models.baselines.recurrent import RecurrentForecaster
 from egopose.motion.motion import Motion
 from egopose.motion.rotations import Array
 from egopose.regression import load_regressor
@@ -90,7 +92,9 @@ def run_forecast_evaluation(
     Raises:
         InputError: a setting is wrong, or no fragment of the split is long enough for a window.
     """
-    settings = from_mapping(ForecastSettings, config["forecast"], "conf/evaluate.yaml: forecast")
+    values = dict(config["forecast"])
+    compared = dict(values.pop("baselines", None) or {})
+    settings = from_mapping(ForecastSettings, values, "conf/evaluate.yaml: forecast")
     material, split = agents[0].material, str(config["split"])
     humanoid, fps = material.humanoid, 1.0 / material.humanoid.control_dt
     windows = windows_of(agents[0], split, settings)
@@ -99,6 +103,8 @@ def run_forecast_evaluation(
     hands = [int(d) for d in humanoid.hand_dofs]
 
     methods: dict[str, list[Any]] = {OURS: [], DRAWN: [], STILL: []}
+    for name, run in compared.items():
+        methods[name] = [score_forecasts(truth, windows, _baseline_futures(agents[0], windows, str(run)), hands, fps)]
     coverage, futures = [], []
     for agent in agents:
         states = start_states(agent, windows, settings)
@@ -117,7 +123,7 @@ def run_forecast_evaluation(
 
     interval = config["interval"]
     comparison = report.compare_forecasts(
-        methods, STILL, float(interval["level"]), int(interval["draws"]), int(interval["seed"])
+        methods, OURS, float(interval["level"]), int(interval["draws"]), int(interval["seed"])
     )
     rendered = any(v is not None and v.rendered for v in videos)
     notes = [
@@ -175,13 +181,34 @@ def start_states(agent: Agent, windows: Sequence[ForecastWindow], settings: Fore
     reference = {key: torch.as_tensor(material.reference[key][now]).double() for key in ("qpos", "qvel")}
     if settings.start == "reference":
         return reference["qpos"], reference["qvel"]
-    if material.regressor is None:
-        raise InputError(agent.path, "regressor", "forecasts begin from the state regressor's state, and there is none")
-    model, _ = load_regressor(material.regressor)
-    flow = TakeStore.open(store_folder(agent.config)).flow(flow_name(agent.config))
-    first = [offsets[w.take] + w.start for w in windows]
-    states = context_states(model, flow, first, windows[0].context)[:, -1].double().numpy()
+    states = regressed_contexts(agent, windows)[:, -1].double().numpy()
     return placed_states(states, reference["qpos"].numpy(), np.asarray(material.humanoid.joint_range))
+
+
+def regressed_contexts(agent: Agent, windows: Sequence[ForecastWindow]) -> Tensor:
+    """:func:`egopose.inference.context_states.context_states` of the run's state regressor: z ``[W, context, S]``.
+
+    Raises:
+        InputError: the run's state regressor or the flow it reads is not there.
+    """
+    if agent.material.regressor is None:
+        raise InputError(agent.path, "regressor", "forecasts begin from the state regressor's state, and there is none")
+    model, _ = load_regressor(agent.material.regressor)
+    flow = TakeStore.open(store_folder(agent.config)).flow(flow_name(agent.config))
+    offsets = agent.material.takes.offsets.tolist()
+    return context_states(model, flow, [offsets[w.take] + w.start for w in windows], windows[0].context)
+
+
+def _baseline_futures(agent: Agent, windows: Sequence[ForecastWindow], run: str) -> Array:
+    """``[W, 1, H, nq]`` of a trained recurrent baseline, from the same regressor's poses of the same contexts.
+
+    Raises:
+        InputError: the run is not one of a recurrent baseline of the same humanoid.
+    """
+    model = load_baseline(run).model
+    if not isinstance(model, RecurrentForecaster):
+        raise InputError(run, "baseline", "forecasts nothing; name runs of baseline=erd or aclstm")
+    return forecast_qpos(model, regressed_contexts(agent, windows), agent.material, windows)[:, None]
 
 
 def forecast_windows_of(

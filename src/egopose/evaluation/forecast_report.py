@@ -30,25 +30,26 @@ Methods = Mapping[str, Sequence[ForecastScores]]
 
 @dataclass(frozen=True)
 class ForecastComparison:
-    """``figures[method][metric]`` and ``ratios[method][metric]`` to ``baseline``: an interval for each of ``horizons``
-    (s), None where forecasts end before it."""
+    """``figures[method][metric]``, and ``ratios[other][metric]`` of ``ours`` to each other method: an interval for each
+    of ``horizons`` (s), None where forecasts end before it."""
 
     horizons: tuple[float, ...]
-    baseline: str
+    ours: str
     figures: Mapping[str, Mapping[str, list[Interval | None]]]
     ratios: Mapping[str, Mapping[str, list[Interval | None]]]
 
 
 def compare_forecasts(
-    methods: Methods, baseline: str, level: float = 0.95, draws: int = 2000, seed: int = 0
+    methods: Methods, ours: str, level: float = 0.95, draws: int = 2000, seed: int = 0
 ) -> ForecastComparison:
-    """Means with bootstrap intervals over runs and takes, and ratios to the baseline on the same windows.
+    """Means with bootstrap intervals over runs and takes, and ratios of ``ours`` to others on the same windows.
 
-    Of a method with several futures a window, ``NAME`` is their mean and ``NAME, best of K`` the best at each horizon.
+    Of a method with several futures a window, ``NAME`` is their mean and ``NAME, best of K`` the best at each horizon;
+    nothing is divided by those.
 
     Args:
-        methods: all on the same windows; ``baseline`` is one of them.
-        baseline: what others are divided by.
+        methods: all on the same windows, each with one run or as many as ``ours``.
+        ours: one of them, with one future a window.
         level, draws, seed: of the intervals.
     """
     found: dict[str, dict[str, Array]] = {}
@@ -57,41 +58,34 @@ def compare_forecasts(
         if runs[0].samples > 1:
             best = f"{name}, best of {runs[0].samples}"
             found[best] = {m: np.stack([run.per_take(m, "best") for run in runs]) for m in METRICS}
-    horizons = tuple(float(h) for h in methods[baseline][0].horizons)
+    horizons = tuple(float(h) for h in methods[ours][0].horizons)
 
-    def columns(table: Array) -> Iterator[Array | None]:
-        for r in range(len(horizons)):
-            yield None if np.isnan(table[:, :, r]).all() else table[:, :, r]
+    def figure(table: Array) -> Interval | None:
+        return None if np.isnan(table).all() else mean_interval(table, level, draws, seed)
 
-    base = {m: list(columns(found[baseline][m])) for m in METRICS}
+    def ratio(mine: Array, other: Array) -> Interval | None:
+        return ratio_interval(mine, other, level, draws, seed) if np.nansum(other) > 0 else None
+
+    others = [name for name, runs in methods.items() if name != ours and runs[0].samples == 1]
+    columns = range(len(horizons))
     figures = {
-        name: {m: [None if c is None else mean_interval(c, level, draws, seed) for c in columns(t[m])] for m in METRICS}
-        for name, t in found.items()
+        name: {m: [figure(table[m][:, :, r]) for r in columns] for m in METRICS} for name, table in found.items()
     }
     ratios = {
-        name: {
-            m: [
-                None if c is None or b is None or not b.mean() > 0 else ratio_interval(c, b, level, draws, seed)
-                for c, b in zip(columns(t[m]), base[m], strict=True)
-            ]
-            for m in METRICS
-        }
-        for name, t in found.items()
-        if name != baseline
+        name: {m: [ratio(found[ours][m][:, :, r], found[name][m][:, :, r]) for r in columns] for m in METRICS}
+        for name in others
     }
-    return ForecastComparison(horizons, baseline, figures, ratios)
+    return ForecastComparison(horizons, ours, figures, ratios)
 
 
 def rows(comparison: ForecastComparison) -> tuple[list[str], list[list[str]]]:
-    """Header and rows of strings: a row a metric and horizon, a column a method, then the ratios to the baseline."""
-    divided = list(comparison.ratios)
-    header = ["metric", "horizon", *comparison.figures, *(f"{m} / {comparison.baseline}" for m in divided)]
+    """Header and rows of strings: a row a metric and horizon, a column a method, then ours divided by the others."""
+    header = ["metric", "horizon", *comparison.figures, *(f"{comparison.ours} / {m}" for m in comparison.ratios)]
     body = []
     for metric in METRICS:
         label = f"{metric} ({_UNITS[metric]})" if _UNITS[metric] else metric
         for r, horizon in enumerate(comparison.horizons):
-            cells = [_cell(table[metric][r]) for table in comparison.figures.values()]
-            cells += [_cell(comparison.ratios[m][metric][r]) for m in divided]
+            cells = [_cell(table[metric][r]) for table in (*comparison.figures.values(), *comparison.ratios.values())]
             if any(cell != "-" for cell in cells):
                 body.append([label, f"{horizon:.2f} s", *cells])
     return header, body
@@ -126,7 +120,7 @@ def write_forecast_results(
         **about,
         "windows": list(labels),
         "horizons_s": list(comparison.horizons),
-        "baseline": comparison.baseline,
+        "divided": comparison.ours,
         "figures": plain(comparison.figures),
         "ratios": plain(comparison.ratios),
     }
