@@ -13,7 +13,8 @@ from torch import Tensor
 
 from egopose.vision.encoders import FlowEncoder
 from egopose.vision.flow import FlowConfig, flow_of_frames
-from egopose.vision.video import iter_frames
+from egopose.vision.lens import Camera, undo_rolling_shutter
+from egopose.vision.video import iter_frames, probe_video
 
 
 def extract_flow(
@@ -22,6 +23,7 @@ def extract_flow(
     fps: float = 30.0,
     offset: float = 0.0,
     count: int | None = None,
+    camera: Camera | None = None,
 ) -> NDArray[np.float16]:
     """Flow of a video in step with a motion.
 
@@ -31,6 +33,7 @@ def extract_flow(
         fps: the motion's rate.
         offset: sync offset (s): what the motion shows at t, the video shows at t + offset.
         count: frames of the motion; None takes the video to its end.
+        camera: lens, shutter and rate of a real camera, to be undone.
 
     Returns:
         ``[T, 2, S, S]`` float16, image widths per frame; frame t's is from t-1 to t, frame 0's is zero.
@@ -39,7 +42,14 @@ def extract_flow(
         InputError: the video cannot be read or does not cover the motion.
     """
     config = cfg if isinstance(cfg, FlowConfig) else FlowConfig(**dict(cfg))
-    return np.stack(list(flow_of_frames(iter_frames(path, fps, offset, count), config)))
+    if camera is None:
+        return np.stack(list(flow_of_frames(iter_frames(path, fps, offset, count), config)))
+    info = probe_video(path)
+    rectify = camera.rectifier(info.width, info.height, config.working_size)
+    # The middle row, which stands for the frame, is exposed half a readout after its stamp.
+    frames = iter_frames(path, fps, offset - 0.5 * camera.readout, count, camera.fps)
+    flow = np.stack(list(flow_of_frames(map(rectify, frames), config)))
+    return undo_rolling_shutter(flow, camera.readout, 1.0 / fps) if camera.readout else flow
 
 
 @torch.no_grad()

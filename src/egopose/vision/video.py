@@ -149,11 +149,15 @@ def probe_video(path: str | PathLike[str]) -> VideoInfo:
         return info
 
 
-def read_frames(path: str | PathLike[str]) -> Iterator[tuple[float, Frame]]:
+def read_frames(path: str | PathLike[str], taken_at: float | None = None) -> Iterator[tuple[float, Frame]]:
     """Decode a video: ``(seconds since its first frame, RGB frame)`` in order.
 
     The times are the file's own presentation stamps, so videos of a varying rate come out right. Where a stamp does
     not advance (some recorders leave them out) the header's rate takes its place.
+
+    Args:
+        path: any MP4.
+        taken_at: frames/s at which the camera took them, where the stamps are known to be wrong (slow motion).
 
     Raises:
         InputError: missing, empty or damaged file, no frame in it, a size or rate that cannot be, frames of different
@@ -161,6 +165,7 @@ def read_frames(path: str | PathLike[str]) -> Iterator[tuple[float, Frame]]:
     """
     with _capture(path) as (capture, info):
         first = last = None
+        count = 0
         while True:
             try:
                 ok, bgr = capture.read()
@@ -171,6 +176,8 @@ def read_frames(path: str | PathLike[str]) -> Iterator[tuple[float, Frame]]:
             stamp = capture.get(cv2.CAP_PROP_POS_MSEC) / 1000.0
             if first is None or last is None:
                 first, time = stamp, 0.0
+            elif taken_at is not None:
+                time = count / taken_at
             else:
                 time = stamp - first if stamp - first > last else last + 1.0 / info.fps
                 if time - last > MAX_GAP:
@@ -179,6 +186,7 @@ def read_frames(path: str | PathLike[str]) -> Iterator[tuple[float, Frame]]:
                     )
                     raise InputError(path, "time stamps", cause)
             last = time
+            count += 1
             if bgr.shape != (info.height, info.width, 3):
                 raise InputError(path, "size", f"a frame of {bgr.shape[1]} x {bgr.shape[0]} among others: damaged")
             yield time, cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB).astype(np.uint8, copy=False)
@@ -187,7 +195,11 @@ def read_frames(path: str | PathLike[str]) -> Iterator[tuple[float, Frame]]:
 
 
 def iter_frames(
-    path: str | PathLike[str], fps: float = 30.0, offset: float = 0.0, count: int | None = None
+    path: str | PathLike[str],
+    fps: float = 30.0,
+    offset: float = 0.0,
+    count: int | None = None,
+    taken_at: float | None = None,
 ) -> Iterator[Frame]:
     """The video's frames at the motion's times: frame k is the one nearest to video time ``k / fps + offset``.
 
@@ -196,6 +208,7 @@ def iter_frames(
         fps: the motion's rate.
         offset: sync offset in seconds: what the motion shows at time t, the video shows at t + offset.
         count: number of motion frames; None takes every one until the video ends.
+        taken_at: frames/s at which the camera took them, see :func:`read_frames`.
 
     Raises:
         InputError: as :func:`read_frames`; and when the motion starts before the video or ends after it by more than
@@ -209,7 +222,7 @@ def iter_frames(
         raise InputError(path, "sync_offset", f"the motion starts {-offset:.3f} s before the video: cut its beginning")
     previous: tuple[float, Frame] | None = None
     interval = 1.0 / fps
-    for time, frame in read_frames(path):
+    for time, frame in read_frames(path, taken_at):
         if previous is not None:
             interval = time - previous[0]
             middle = 0.5 * (previous[0] + time)

@@ -1,0 +1,151 @@
+"""A real camera: how its lens bends the picture, how its shutter rolls, how fast it took frames.
+
+Flow of such a camera is brought to what the rendered videos have, a pinhole whose rows are all exposed at once:
+pictures are rectified before the flow, and the flow is divided by the time that really passed between its two rows.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from egopose.config import from_mapping
+from egopose.errors import InputError
+from egopose.motion.rotations import Array
+from egopose.vision.video import Frame
+
+LENSES = ("pinhole", "fisheye")
+# Where the search for the angle of a radius ends: nearly 90 degrees, which no flat picture can show.
+_WIDEST = np.deg2rad(85.0)
+_MOST_COEFFICIENTS = {"pinhole": 5, "fisheye": 4}
+
+
+@dataclass(frozen=True)
+class Camera:
+    """One take's camera (``camera`` of a take; ``conf/data/own.yaml`` gives sources of the numbers).
+
+    Args:
+        field_of_view: degrees across the whole width of the frame; None leaves the picture as it is.
+        lens: ``pinhole`` (or a camera's *linear* mode) or ``fisheye``: equidistant, radius = f * angle.
+        distortion: OpenCV's coefficients: ``k1 k2 p1 p2 k3`` of a pinhole, ``k1 k2 k3 k4`` of a fisheye.
+        view: degrees across the square picture that flow sees; less where the lens sees less.
+        readout: s from the exposure of the first row to that of the last.
+        fps: frames/s at which the camera took the video; None believes the file's time stamps.
+
+    Raises:
+        InputError: a value that cannot be; names it.
+    """
+
+    field_of_view: float | None = None
+    lens: str = "pinhole"
+    distortion: tuple[float, ...] = ()
+    view: float = 102.5
+    readout: float = 0.0
+    fps: float | None = None
+
+    def __post_init__(self) -> None:
+        if self.lens not in LENSES:
+            raise InputError("camera", "lens", f"{self.lens!r}; there are {', '.join(LENSES)}")
+        widest = 170.0 if self.lens == "pinhole" else 220.0
+        if self.field_of_view is not None and not 1.0 <= self.field_of_view <= widest:
+            raise InputError(
+                "camera", "field_of_view", f"{self.field_of_view} degrees; a {self.lens} has 1 to {widest:g}"
+            )
+        if self.field_of_view is None and (self.lens != "pinhole" or self.distortion):
+            raise InputError("camera", "field_of_view", "is missing: without it the lens cannot be undone")
+        if len(self.distortion) > _MOST_COEFFICIENTS[self.lens] or not np.isfinite(self.distortion).all():
+            cause = f"at most {_MOST_COEFFICIENTS[self.lens]} finite numbers for a {self.lens}"
+            raise InputError("camera", "distortion", cause)
+        if not 1.0 <= self.view <= 170.0:
+            raise InputError("camera", "view", f"{self.view} degrees; 1 to 170")
+        if not 0.0 <= self.readout <= 0.1:
+            raise InputError("camera", "readout", f"{self.readout} s; 0 to 0.1 (is it in milliseconds?)")
+        if self.fps is not None and not 1.0 <= self.fps <= 1000.0:
+            raise InputError("camera", "fps", f"{self.fps}; 1 to 1000")
+
+    @classmethod
+    def from_mapping(cls, values: Mapping[str, Any] | None, source: str) -> Camera:
+        """From a take's ``camera``; None is a camera of which nothing is known.
+
+        Raises:
+            InputError: an unknown setting or a value that cannot be; names ``source``.
+        """
+        try:
+            return from_mapping(cls, values or {}, source)
+        except InputError as error:
+            raise InputError(source, error.field, error.cause) from None
+
+    def radius(self, angle: Array) -> Array:
+        """Distance from the picture's middle, in focal lengths, of a ray at ``angle`` (rad) from the axis."""
+        k = np.zeros(5)
+        k[: len(self.distortion)] = self.distortion
+        if self.lens == "fisheye":
+            return angle * (1 + k[0] * angle**2 + k[1] * angle**4 + k[2] * angle**6 + k[3] * angle**8)
+        t = np.tan(angle)
+        return t * (1 + k[0] * t**2 + k[1] * t**4 + k[4] * t**6)
+
+    def focal_length(self, width: int) -> float:
+        """In pixels, of a frame ``width`` pixels wide, whose middle the axis meets."""
+        assert self.field_of_view is not None
+        return 0.5 * width / float(self.radius(np.array(np.deg2rad(0.5 * self.field_of_view))))
+
+    def seen_view(self, width: int, height: int) -> float:
+        """Degrees across the square that flow sees: :attr:`view`, or what the lens shows to the nearest edge."""
+        angles = np.linspace(0.0, _WIDEST, 2000)
+        nearest = 0.5 * min(width, height) / self.focal_length(width)
+        inside = self.radius(angles) <= nearest
+        edge = angles[-1] if inside.all() else angles[int(np.argmin(inside)) - 1]
+        return float(min(self.view, np.rad2deg(2 * edge)))
+
+    def rectifier(self, width: int, height: int, size: int) -> Callable[[Frame], Frame]:
+        """What turns a frame ``[height, width, 3]`` into a pinhole's square ``[2 size, 2 size, 3]``.
+
+        Raises:
+            InputError: the distortion folds the picture: its coefficients are not of this lens.
+        """
+        if self.field_of_view is None:
+            return lambda frame: frame
+        if not (np.diff(self.radius(np.linspace(0.0, np.deg2rad(0.5 * self.field_of_view), 200))) > 0).all():
+            raise InputError("camera", "distortion", "folds the picture over: not the coefficients of this lens")
+        # Shrunk first: a picture of many pixels sampled at few points would flicker.
+        side = 2 * size
+        scale = min(1.0, side / min(width, height))
+        small = (max(round(width * scale), 1), max(round(height * scale), 1))
+        focal = self.focal_length(width) * small[0] / width
+        own = np.array([[focal, 0, 0.5 * (small[0] - 1)], [0, focal, 0.5 * (small[1] - 1)], [0, 0, 1.0]])
+        pinhole = 0.5 * side / np.tan(np.deg2rad(0.5 * self.seen_view(width, height)))
+        square = np.array([[pinhole, 0, 0.5 * (side - 1)], [0, pinhole, 0.5 * (side - 1)], [0, 0, 1.0]])
+        coefficients = np.zeros(4 if self.lens == "fisheye" else 5)
+        coefficients[: len(self.distortion)] = self.distortion
+        undistort = cv2.fisheye.initUndistortRectifyMap if self.lens == "fisheye" else cv2.initUndistortRectifyMap
+        maps = undistort(own, coefficients, np.eye(3), square, (side, side), cv2.CV_32FC1)
+
+        def rectify(frame: Frame) -> Frame:
+            shrunk = frame if scale == 1.0 else cv2.resize(frame, small, interpolation=cv2.INTER_AREA)
+            return cv2.remap(shrunk, maps[0], maps[1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE).astype(
+                np.uint8, copy=False
+            )
+
+        return rectify
+
+
+def undo_rolling_shutter(flow: NDArray[np.floating], readout: float, interval: float) -> NDArray[np.float16]:
+    """Flow ``[..., 2, S, S]`` as if all rows had been exposed at once, to first order.
+
+    A point that moved down by v of the picture's height was seen v * readout later than its frame's stamp says: its
+    motion took interval + v * readout, not interval.
+
+    Args:
+        flow: channel 1 down, in picture widths (the picture is square) per ``interval``.
+        readout: s from the picture's first row to its last.
+        interval: s between the two frames.
+    """
+    wide = np.asarray(flow, dtype=np.float64)
+    # More than half an interval of delay is no turn of a head but a faulty vector.
+    delay = np.clip(wide[..., 1:, :, :] * readout / interval, -0.5, 0.5)
+    return (wide / (1.0 + delay)).astype(np.float16)
