@@ -8,6 +8,7 @@ import sys
 VERBS = {
     "demo": "train a policy on the default data, evaluate it, show a table and a video",
     "prepare": "turn motion files and videos into a store: retarget, render or decode, flow, features",
+    "sync": "find the offset between a video and a motion, by how the head turns in both",
     "train": "train a policy (Hydra: group=choice key=value, --multirun)",
     "baseline": "train a method that policies are compared with: ERD, acLSTM, PathPose",
     "evaluate": "score a checkpoint on held-out takes beside PoseReg: tables, CSV, BVH, side-by-side MP4",

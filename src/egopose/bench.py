@@ -4,6 +4,7 @@ env: the collection loop beside MuJoCo's own speed.
 features: from an MP4 to visual features beside decoding alone.
 rates: what coarser physics costs in tracking and energy, and what it saves.
 scaling: the cost of every part of an iteration, and the memory of workers that share the data.
+sync: how well the offset between a motion and its video is found.
 resume: a training killed at random moments beside the same one left alone.
 """
 
@@ -22,7 +23,7 @@ from importlib import import_module  # noqa: E402
 from egopose.errors import InputError  # noqa: E402
 
 #: Verbs and how many rounds each takes unless told; a verb's module is ``egopose.benchmarks.<verb>``.
-VERBS = {"env": 9, "update": 5, "resume": 50, "features": 9, "scaling": 5, "rates": 3}
+VERBS = {"env": 9, "update": 5, "resume": 50, "features": 9, "scaling": 5, "rates": 3, "sync": 8}
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

@@ -6,6 +6,7 @@ import hashlib
 import json
 import os
 from collections.abc import Mapping
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +25,8 @@ from egopose.humanoid.model import HumanoidModel, build_humanoid
 from egopose.motion.io import read_motion
 from egopose.motion.motion import Motion
 from egopose.motion.retarget import RetargetReport
+from egopose.vision.flow import FlowConfig
+from egopose.vision.lens import Camera
 
 #: Raise it whenever changed code gives another reference, video or flow for unchanged settings and sources: reading of
 #: motion files, retargeting, settling, making of the humanoid, rendering, optical flow. Stores are then made anew.
@@ -50,6 +53,7 @@ def fingerprint_of(config: Mapping[str, Any]) -> str:
     data = config["data"]
     sources = [
         [s.name, s.subject, s.motion.stat().st_size, str(s.video), s.sync_offset, s.options, s.mapping]
+        + ([asdict(s.camera)] if s.camera else [])
         for s in find_sources(data)
     ]
     parts = [sources, config["humanoid"], data.get("preparation"), config["sim"]["control_hz"], PREPARATION_VERSION]
@@ -103,7 +107,10 @@ def _make_motions(config: Mapping[str, Any], root: Path, progress: bool) -> Take
     with _bar("motions", "takes", progress) as bar:
         task = bar.add_task("motions", total=len(sources))
         for source in sources:
-            clip, report = _reference(source, humanoid, settings)
+            motion = read_motion(source.motion, **source.options)
+            if source.sync_offset is None:
+                source = replace(source, sync_offset=_find_offset(config, source, motion))
+            clip, report = reference_motion(motion, humanoid, settings, source.mapping)
             body = reference_states(humanoid, clip)
             contacts = clip.contacts if clip.contacts is not None else np.ones((len(clip), 1), dtype=bool)
             infos.append(
@@ -118,12 +125,13 @@ def _make_motions(config: Mapping[str, Any], root: Path, progress: bool) -> Take
     return TakeStore.create(root, fps, fingerprint_of(config), infos, clips, torch.cat(states))
 
 
-def _reference(
-    source: TakeSource, humanoid: HumanoidModel, settings: PreparationSettings
-) -> tuple[Motion, RetargetReport]:
-    motion = read_motion(source.motion, **source.options)
-    clip, report = reference_motion(motion, humanoid, settings, source.mapping)
-    return clip, report
+def _find_offset(config: Mapping[str, Any], source: TakeSource, motion: Motion) -> float:
+    from egopose.data.sync import settings_of, sync_offset
+
+    assert source.video is not None
+    flow = FlowConfig(**config["vision"]["flow"])
+    found = sync_offset(source.video, motion, settings_of(config["data"]), flow, source.camera, source.mapping)
+    return found.offset
 
 
 def _row(
@@ -143,10 +151,11 @@ def _row(
         lowest_head_height=float(body["xpos"][:, humanoid.head, 2].min()),
         source=source.motion.name,
         video=f"videos/{source.name}.mp4" if source.video is None else str(source.video),
-        sync_offset=source.sync_offset,
+        sync_offset=source.sync_offset or 0.0,
         rendered=source.video is None,
         supported=runs_of(feasible),
         retargeting_mm=float(np.mean([mean for mean, _ in report.position_mm.values()])),
+        camera=asdict(source.camera) if source.camera else None,
     )
 
 
@@ -196,7 +205,8 @@ def _make_flow(config: Mapping[str, Any], store: TakeStore, progress: bool) -> N
         task = bar.add_task("flow", total=sum(store.takes[i].length for i in todo))
         for index in todo:
             take = store.takes[index]
-            flow = extract_flow(store.video(index), settings, store.fps, take.sync_offset, take.length)
+            camera = Camera.from_mapping(take.camera, take.name) if take.camera else None
+            flow = extract_flow(store.video(index), settings, store.fps, take.sync_offset, take.length, camera)
             table[store.frames(index)] = torch.from_numpy(flow)
             store.mark_flow(name, index)
             bar.advance(task, take.length)

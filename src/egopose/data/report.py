@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from egopose.data.store import TakeStore
+from egopose.data.store import TakeInfo, TakeStore
 
 
 def store_report(store: TakeStore) -> str:
@@ -12,8 +12,12 @@ def store_report(store: TakeStore) -> str:
         feasible = sum(b - a for a, b in take.supported) / take.length
         lines.append(
             f"{take.name:<34}{take.subject:>9}{take.length:>8}{take.length / store.fps:>9.1f}"
-            f"{take.retargeting_mm:>13.1f}{feasible:>10.0%}  {'rendered' if take.rendered else take.video}"
+            f"{take.retargeting_mm:>13.1f}{feasible:>10.0%}  {_video(take)}"
         )
     total = store.frames_total
     lines.append(f"{len(store.takes)} takes, {total} frames, {total / store.fps / 60:.1f} min: {store.root}")
     return "\n".join(lines)
+
+
+def _video(take: TakeInfo) -> str:
+    return "rendered" if take.rendered else f"{take.video} at {take.sync_offset:+.3f} s"

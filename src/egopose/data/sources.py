@@ -12,6 +12,7 @@ from typing import Any
 
 from egopose.config import convert
 from egopose.errors import InputError
+from egopose.vision.lens import Camera
 
 _MAX_FILES = 100_000
 
@@ -26,8 +27,9 @@ class TakeSource:
         motion: file to read.
         options: for the reader (``unit``, ``up``, ``asf`` ...).
         video: the wearer's MP4, or None to render one.
-        sync_offset: s, see :class:`egopose.data.store.TakeInfo`.
+        sync_offset: s, see :class:`egopose.data.store.TakeInfo`; None: to be found (:mod:`egopose.data.sync`).
         mapping: part -> joint for skeletons whose names say too little.
+        camera: that took the video, or None where nothing is known of it.
     """
 
     name: str
@@ -35,8 +37,9 @@ class TakeSource:
     motion: Path
     options: dict[str, Any]
     video: Path | None = None
-    sync_offset: float = 0.0
+    sync_offset: float | None = 0.0
     mapping: dict[str, str] | None = None
+    camera: Camera | None = None
 
 
 def find_sources(settings: Mapping[str, Any]) -> list[TakeSource]:
@@ -45,7 +48,8 @@ def find_sources(settings: Mapping[str, Any]) -> list[TakeSource]:
     Args:
         settings: ``source``: ``embedded``, ``folder`` (``folder``, ``pattern``: a glob; ``subject``: a regular
             expression whose first group is the subject) or ``takes`` (a list of ``{motion, video, sync_offset, subject,
-            name}``); ``exclude``: take names left out; ``reader``: options for the reader.
+            name, reader, mapping, camera}``); ``exclude``: take names left out; ``reader``: options for the reader;
+            ``camera``: of every take that does not say otherwise.
 
     Raises:
         InputError: a file is missing or nothing is found; names the field.
@@ -60,7 +64,11 @@ def find_sources(settings: Mapping[str, Any]) -> list[TakeSource]:
             )
         found = _in_folder(Path(str(settings["folder"])).expanduser(), settings)
     elif kind == "takes":
-        found = _listed(settings.get("takes"), _options(settings.get("reader"), "data.reader"))
+        found = _listed(
+            settings.get("takes"),
+            _options(settings.get("reader"), "data.reader"),
+            _options(settings.get("camera"), "data.camera"),
+        )
     else:
         raise InputError("data", "source", f"must be embedded, folder or takes, not {kind!r}")
     names = [s.name for s in found]
@@ -115,7 +123,10 @@ def _options(value: Any, field: str) -> dict[str, Any]:
     return {str(key): option for key, option in (value or {}).items()}
 
 
-def _listed(rows: Any, reader: dict[str, Any]) -> list[TakeSource]:
+_TAKE_SETTINGS = {"motion", "video", "sync_offset", "subject", "name", "reader", "mapping", "camera"}
+
+
+def _listed(rows: Any, reader: dict[str, Any], camera: dict[str, Any]) -> list[TakeSource]:
     if not isinstance(rows, Sequence) or isinstance(rows, str):
         raise InputError("data", "data.takes", f"must be a list of {{motion: FILE, ...}}, not {rows!r:.60}")
     out = []
@@ -123,8 +134,11 @@ def _listed(rows: Any, reader: dict[str, Any]) -> list[TakeSource]:
         label = f"data.takes[{number}]"
         if not isinstance(row, Mapping):
             raise InputError("data", label, f"must be {{motion: FILE, ...}}, not {row!r:.60}")
-        if unknown := set(row) - {"motion", "video", "sync_offset", "subject", "name", "reader", "mapping"}:
-            raise InputError("data", label, f"has no setting {sorted(map(str, unknown))[0]!r:.60}")
+        if unknown := set(row) - _TAKE_SETTINGS:
+            cause = (
+                f"has no setting {sorted(map(str, unknown))[0]!r:.60}; there are {', '.join(sorted(_TAKE_SETTINGS))}"
+            )
+            raise InputError("data", label, cause)
         for key in ("motion", "video"):
             if row.get(key) is not None and (not isinstance(row[key], str) or "\0" in row[key]):
                 raise InputError("data", f"{label}.{key}", f"must be a path, not {row[key]!r:.60}")
@@ -136,6 +150,7 @@ def _listed(rows: Any, reader: dict[str, Any]) -> list[TakeSource]:
         name = str(row.get("name") or motion.name.split(".")[0])
         if name in (".", "..") or re.search(r"[/\\\0]", name):
             raise InputError("data", f"{label}.name", f"{name!r} cannot be the name of a file")
+        filmed = Camera.from_mapping({**camera, **_options(row.get("camera"), f"{label}.camera")}, f"{label}.camera")
         out.append(
             TakeSource(
                 name,
@@ -143,13 +158,26 @@ def _listed(rows: Any, reader: dict[str, Any]) -> list[TakeSource]:
                 motion,
                 {**reader, **_options(row.get("reader"), f"{label}.reader")},
                 Path(row["video"]).expanduser().resolve() if row.get("video") else None,
-                convert(row.get("sync_offset", 0.0), float, "data", f"{label}.sync_offset"),
+                _sync_offset(row, label),
                 _options(row["mapping"], f"{label}.mapping") if row.get("mapping") else None,
+                filmed if row.get("video") and filmed != Camera() else None,
             )
         )
     if not out:
         raise InputError("data", "takes", "the list is empty")
     return out
+
+
+def _sync_offset(row: Mapping[str, Any], label: str) -> float | None:
+    value = row.get("sync_offset", 0.0)
+    if value == "auto":
+        if not row.get("video"):
+            raise InputError("data", f"{label}.sync_offset", "auto needs a video to look in")
+        return None
+    try:
+        return float(convert(value, float, "data", f"{label}.sync_offset"))
+    except InputError as error:
+        raise InputError("data", error.field, f"{error.cause} (seconds, or auto to have it found)") from None
 
 
 def _is_file(text: str) -> bool:

@@ -52,6 +52,7 @@ class TakeInfo:
         rendered: whether the video was rendered from the motion.
         supported: ``[[start, stop], ...]`` frames in which a body on a bare floor could be in.
         retargeting_mm: mean distance of the retargeted joints to their source, mm.
+        camera: settings of :class:`egopose.vision.lens.Camera` of a user's own video, or None.
     """
 
     name: str
@@ -65,6 +66,7 @@ class TakeInfo:
     rendered: bool
     supported: tuple[tuple[int, int], ...]
     retargeting_mm: float
+    camera: Any = None
 
 
 @dataclass(frozen=True)
@@ -273,6 +275,8 @@ def _take_info(path: Path, row: Any, number: int) -> TakeInfo:
     inside = bool(parts) and not Path(take.video).is_absolute() and ".." not in parts
     if take.name in ("", ".", "..") or re.search(r"[/\\\0]", take.name) or (take.rendered and not inside):
         raise InputError(path, where, f"{take.name!r:.60}, {take.video!r:.60}: lies outside the store")
+    if take.camera is not None and not isinstance(take.camera, dict):
+        raise InputError(path, f"{where}.camera", f"must be settings of a camera, not {take.camera!r:.60}")
     return take
 
 
