@@ -1,0 +1,32 @@
+"""Which control frame a camera's frame belongs to, whatever the camera's rate."""
+
+from __future__ import annotations
+
+# A frame less than this share of a control frame ahead is taken for the same one; lower than a half, so that a camera
+# at the control rate whose stamps waver is not now doubled, now skipped.
+_SAME = 0.25
+
+
+class ControlClock:
+    """Control frames passed since the last frame used.
+
+    Args:
+        rate: control frames a second.
+    """
+
+    def __init__(self, rate: float) -> None:
+        self._rate = rate
+        self._due: float | None = None
+
+    def intervals(self, time: float) -> int:
+        """Control frames from the last frame used to one at ``time`` (s): at least 1 where it is to be used (the first
+        always is), 0 where the camera is ahead of the control rate and it is not."""
+        if self._due is None:
+            self._due = time
+            return 1
+        ahead = (time - self._due) * self._rate
+        if ahead < _SAME:
+            return 0
+        count = max(round(ahead), 1)
+        self._due += count / self._rate
+        return count

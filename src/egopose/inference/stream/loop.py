@@ -1,0 +1,188 @@
+"""The live loop: one thread reads the source, this one does the rest, frame by frame, and never falls behind.
+
+The rule for late frames: only the newest frame waits (:class:`NewestFrame`). A frame that was skipped has no flow of
+its own; the flow from the last frame used to the next one is shared evenly by the control frames between, so that the
+body keeps in step with time. Where more than ``bridge`` frames are missing the rest are jumped over.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from egopose.inference.causal import CausalRegression
+from egopose.inference.stream.body import LiveBody, LivePose
+from egopose.inference.stream.clock import ControlClock
+from egopose.inference.stream.latency import LatencyTable
+from egopose.inference.stream.memory import MemoryTrace
+from egopose.inference.stream.newest import Captured, NewestFrame
+from egopose.inference.stream.sight import Sight
+from egopose.inference.stream.sources import SourceSettings, capture
+
+#: In the order in which a frame passes them.
+STAGES = ("flow", "encoder", "context", "policy", "physics", "output")
+
+#: Told a pose and how late it is (ms, from its last frame's arrival).
+PoseSink = Callable[[LivePose, float], None]
+#: Told the status once a second.
+StatusSink = Callable[[dict[str, Any]], None]
+
+_STATUS_EVERY = 1.0  # s
+
+
+@dataclass(frozen=True)
+class LoopSettings:
+    """Of ``conf/stream.yaml``.
+
+    Args:
+        seconds: stop after this long; None for the source's end.
+        bridge: control frames without a picture that are filled in at most.
+    """
+
+    seconds: float | None
+    bridge: int
+
+
+@dataclass
+class Counts:
+    """Of frames.
+
+    Attributes:
+        used: pictures that were estimated from.
+        surplus: pictures of a camera quicker than the control rate.
+        bridged: control frames without a picture, filled in.
+        lost: control frames jumped over.
+        poses: given out.
+        resets: of them, placed anew by the fail-safe.
+    """
+
+    used: int = 0
+    surplus: int = 0
+    bridged: int = 0
+    lost: int = 0
+    poses: int = 0
+    resets: int = 0
+
+
+class LiveLoop:
+    """One stream from its first frame to its last.
+
+    Args:
+        source: what to read.
+        sight: frames to visual features.
+        regression: visual features to what the policy needs.
+        body: the humanoid.
+        latency: where times are kept; the table that ``body`` tells its laps.
+        rate: control frames a second.
+        settings: see :class:`LoopSettings`.
+    """
+
+    def __init__(
+        self,
+        source: SourceSettings,
+        sight: Sight,
+        regression: CausalRegression,
+        body: LiveBody,
+        latency: LatencyTable,
+        rate: float,
+        settings: LoopSettings,
+    ) -> None:
+        self._source, self._sight, self._regression, self._body = source, sight, regression, body
+        self._rate, self._settings = rate, settings
+        self._newest, self._clock = NewestFrame(), ControlClock(rate)
+        self.latency, self.memory, self.counts = latency, MemoryTrace(), Counts()
+        self._frame = -1
+        self._began = self._told = time.perf_counter()
+
+    def run(self, on_pose: PoseSink, on_status: StatusSink, stop: threading.Event | None = None) -> dict[str, Any]:
+        """Until the source ends, the time is over, or ``stop`` is set (by another thread).
+
+        Returns:
+            The last status, see :meth:`status`.
+
+        Raises:
+            InputError: the source cannot be read.
+        """
+        stop = stop or threading.Event()
+        reader = threading.Thread(
+            target=capture, args=(self._source, self._rate, self._newest, stop), name="capture", daemon=True
+        )
+        reader.start()
+        self._began = self._told = time.perf_counter()
+        try:
+            while not stop.is_set() and not self._over():
+                captured = self._newest.take(_STATUS_EVERY)
+                if captured is not None:
+                    self._use(captured, on_pose)
+                elif self._newest.ended:
+                    self._drain(on_pose)
+                    break
+                self._tell(on_status)
+        finally:
+            stop.set()
+            self._newest.close()
+            # A camera that hangs in its driver must not keep the program: the thread ends with it.
+            reader.join(timeout=2.0)
+        return self.status()
+
+    def status(self) -> dict[str, Any]:
+        """``seconds`` since the start, the counts, ``dropped`` (late pictures), ``fps`` (pictures used a second),
+        ``stages`` (see :meth:`LatencyTable.percentiles_ms`) and memory (see :meth:`MemoryTrace.report`)."""
+        seconds = time.perf_counter() - self._began
+        return {
+            "seconds": seconds,
+            **vars(self.counts),
+            "dropped": self._newest.dropped,
+            "fps": self.counts.used / max(seconds, 1e-9),
+            "stages": self.latency.percentiles_ms(),
+            **self.memory.report(),
+        }
+
+    def _over(self) -> bool:
+        limit = self._settings.seconds
+        return limit is not None and time.perf_counter() - self._began >= limit
+
+    def _use(self, captured: Captured, on_pose: PoseSink) -> None:
+        intervals = self._clock.intervals(captured.time)
+        if not intervals:
+            self.counts.surplus += 1
+            return
+        steps = min(intervals, self._settings.bridge + 1)
+        self.counts.used += 1
+        self.counts.bridged += steps - 1
+        self.counts.lost += intervals - steps
+        self._frame += intervals - steps
+        latency = self.latency
+        latency.begin()
+        flow = self._sight.flow(captured.image)
+        latency.lap("flow")
+        features = self._sight.features(flow, intervals)
+        latency.lap("encoder")
+        for _ in range(steps):
+            self._frame += 1
+            seen = self._regression.push(self._frame, features)
+            latency.lap("context")
+            if seen is not None:
+                pose = self._body.advance(seen)
+                self._give(pose, on_pose, 1e3 * (time.perf_counter() - captured.arrived))
+                latency.lap("output")
+        latency.end(captured.arrived)
+
+    def _drain(self, on_pose: PoseSink) -> None:
+        for seen in self._regression.drain():
+            self._give(self._body.advance(seen), on_pose, 0.0)
+
+    def _give(self, pose: LivePose, on_pose: PoseSink, delay_ms: float) -> None:
+        self.counts.poses += 1
+        self.counts.resets += pose.reset
+        on_pose(pose, delay_ms)
+
+    def _tell(self, on_status: StatusSink) -> None:
+        now = time.perf_counter()
+        if now - self._told >= _STATUS_EVERY:
+            self._told = now
+            self.memory.sample(now - self._began)
+            on_status(self.status())
