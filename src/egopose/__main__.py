@@ -13,6 +13,7 @@ VERBS = {
     "baseline": "train a method that policies are compared with: ERD, acLSTM, PathPose",
     "evaluate": "score a checkpoint on held-out takes beside PoseReg: tables, CSV, BVH, side-by-side MP4",
     "estimate": "motion from a video alone: BVH and MP4",
+    "stream": "motion live from a camera, a video or an address: WebSocket, file, latencies",
     "bench": "measure the environment's and the pipeline's speed",
 }
 

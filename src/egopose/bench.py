@@ -5,6 +5,7 @@ features: from an MP4 to visual features beside decoding alone.
 rates: what coarser physics costs in tracking and energy, and what it saves.
 scaling: the cost of every part of an iteration, and the memory of workers that share the data.
 sync: how well the offset between a motion and its video is found.
+stream: live estimation: frames a second, latency by stage, late frames, memory.
 resume: a training killed at random moments beside the same one left alone.
 """
 
@@ -23,7 +24,7 @@ from importlib import import_module  # noqa: E402
 from egopose.errors import InputError  # noqa: E402
 
 #: Verbs and how many rounds each takes unless told; a verb's module is ``egopose.benchmarks.<verb>``.
-VERBS = {"env": 9, "update": 5, "resume": 50, "features": 9, "scaling": 5, "rates": 3, "sync": 8}
+VERBS = {"env": 9, "update": 5, "resume": 50, "features": 9, "scaling": 5, "rates": 3, "sync": 8, "stream": 1}
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -34,7 +35,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("verb", choices=list(VERBS))
     parser.add_argument("overrides", nargs="*", metavar="key=value", help="of the training configuration")
     parser.add_argument("--json", action="store_true", help="one JSON object on standard output")
-    parser.add_argument("--rounds", type=int, help="rounds (env, update, features, scaling) or kills (resume)")
+    parser.add_argument("--rounds", type=int, help="rounds (env, update, features, scaling), kills (resume), lengths (stream)")
     options = parser.parse_intermixed_args(arguments)
     verb = import_module(f"egopose.benchmarks.{options.verb}")
     try:
