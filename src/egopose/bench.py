@@ -7,6 +7,7 @@ scaling: the cost of every part of an iteration, and the memory of workers that 
 sync: how well the offset between a motion and its video is found.
 stream: live estimation: frames a second, latency by stage, late frames, memory.
 resume: a training killed at random moments beside the same one left alone.
+export: what every export format loses, by independent readers.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ from importlib import import_module  # noqa: E402
 from egopose.errors import InputError  # noqa: E402
 
 #: Verbs and how many rounds each takes unless told; a verb's module is ``egopose.benchmarks.<verb>``.
-VERBS = {"env": 9, "update": 5, "resume": 50, "features": 9, "scaling": 5, "rates": 3, "sync": 8, "stream": 1}
+VERBS = {"env": 9, "update": 5, "resume": 50, "features": 9, "scaling": 5, "rates": 3, "export": 1, "sync": 8, "stream": 1}
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

@@ -68,9 +68,11 @@ def run_export(source: Path, files: Sequence[str], config: Mapping[str, Any]) ->
             target.parent.mkdir(parents=True, exist_ok=True)
             try:
                 write_motion(motion, target, **{k: v for k, v in options.items() if k in _keywords(suffix)})
-            except (KeyError, ValueError) as error:
-                if isinstance(error, InputError):
-                    raise
+            except InputError:
+                raise
+            except KeyError as error:
+                raise InputError(target, "options", f"{error} is no unit or axis of this format") from None
+            except ValueError as error:
                 raise InputError(target, suffix, f"cannot hold {path}: {error}") from None
             written.append(target)
     return written
