@@ -54,7 +54,7 @@ def test_own_output_is_fed_exactly_where_the_mask_is_false() -> None:
 def test_both_schemes_learn_to_go_on_with_a_sine(settings: RecurrentSettings) -> None:
     work = learner(settings)
     before = work.held_out()
-    result = fit(work, FIT, seed=0, total_frames=80_000)
+    result = fit(work, FIT, seed=0, total_frames=50_000)
     # Errors are in deviations: going nowhere costs about one or two.
     assert before > 0.7
     assert result.held_out < 0.1
@@ -65,8 +65,8 @@ def test_both_schemes_learn_to_go_on_with_a_sine(settings: RecurrentSettings) ->
 
 def test_a_training_that_was_cut_off_ends_as_one_left_alone() -> None:
     whole, parted, saved = learner(), learner(), []
-    first = fit(whole, FIT, seed=0, total_frames=30_000)
-    fit(parted, FIT, seed=0, total_frames=30_000, max_seconds=0.0, save=lambda work: saved.append(work.state()))
+    first = fit(whole, FIT, seed=0, total_frames=20_000)
+    fit(parted, FIT, seed=0, total_frames=20_000, max_seconds=0.0, save=lambda work: saved.append(work.state()))
     assert not saved[-1]["counters"].any()
 
     def interrupt(work: Fit) -> None:
@@ -75,9 +75,9 @@ def test_a_training_that_was_cut_off_ends_as_one_left_alone() -> None:
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        fit(parted, FIT, seed=0, total_frames=30_000, save=interrupt)
+        fit(parted, FIT, seed=0, total_frames=20_000, save=interrupt)
     again = learner()
-    second = fit(again, FIT, seed=0, total_frames=30_000, resume=saved[-1])
+    second = fit(again, FIT, seed=0, total_frames=20_000, resume=saved[-1])
     assert second == first
     for a, b in zip(whole.model.parameters(), again.model.parameters(), strict=True):
         assert torch.equal(a, b)

@@ -1,4 +1,4 @@
-"""VGAIL: torques reach the joints, the discriminator rewards what looks like the reference, it all trains."""
+"""VGAIL: torques reach the joints, the discriminator rewards what looks like the reference."""
 
 from __future__ import annotations
 
@@ -6,17 +6,12 @@ import mujoco
 import numpy as np
 import pytest
 import torch
-from test_material import configuration, fill_flow
 
-from egopose import pipeline
 from egopose.config import compose_config
-from egopose.data import preparation
-from egopose.data.preparation import humanoid_of, prepare
+from egopose.data.preparation import humanoid_of
 from egopose.envs.problem import ActionSettings
-from egopose.errors import InputError
 from egopose.humanoid.torques import torque_driven
 from egopose.training.adversarial import AdversarialPPO, Discriminator, DiscriminatorSettings
-from egopose.training.loop import train
 
 
 def test_a_motors_torque_reaches_its_joint_and_no_further_than_its_limit() -> None:
@@ -55,31 +50,3 @@ def test_the_discriminators_gradient_penalty_is_in_its_own_units_and_its_reward_
     assert like.mean() > 4 * unlike.mean()
     assert like.max() <= 2.0
     assert unlike.min() >= 0.0
-
-
-def test_vgail_trains_saves_and_goes_on(tmp_path, monkeypatch) -> None:
-    monkeypatch.setattr(preparation, "_make_videos", lambda *_: None)
-    config = configuration(tmp_path)
-    choice = compose_config("train", ["experiment=vgail"])
-    config |= {"task": choice["task"]}
-    config["algo"] |= {"discriminator": {**choice["algo"]["discriminator"], "hidden": [8], "batch": 8, "steps": 2}}
-    prepare(config, progress=False, flow=False)
-    fill_flow(config)
-    material = pipeline.load_material(config, progress=False)
-    run = pipeline.build_run(config, tmp_path / "run", material)
-    before = {k: v.clone() for k, v in run.ppo.state()["discriminator"].state_dict().items()}
-    train(run, [])
-    after = run.ppo.state()["discriminator"].state_dict()
-    assert any(not torch.equal(before[k], after[k]) for k in before)
-
-    config["algo"]["iterations"] = 2
-    again = pipeline.build_run(config, tmp_path / "run", material)
-    again.restore(tmp_path / "run" / "checkpoints" / "checkpoint-000000000008")
-    assert all(torch.equal(v, after[k]) for k, v in again.ppo.state()["discriminator"].state_dict().items())
-    assert train(again, []).frames == 16
-    agent = pipeline.load_agent(tmp_path / "run", material, "latest")
-    assert agent.make_env("test").base_env.problem.action.kind == "torque"
-
-    config["model"] = {**config["model"], "context": {**config["model"]["context"], "source": "trainable"}}
-    with pytest.raises(InputError, match="frozen"):
-        pipeline.build_run(config, tmp_path / "other", material)

@@ -74,6 +74,8 @@ PAPER_HORIZONS = {
     "erd": (1.239, 1.309, 1.374, 1.521, 1.619),
     "aclstm": (1.299, 1.297, 1.314, 1.425, 1.511),
 }
+#: Nothing is divided by less: a method that stands still has no acceleration.
+SMALLEST = 1e-6
 METRICS = {"e_pose": "E_pose", "e_vel": "E_vel", "a_accl": "A_accl", "e_key": "E_key"}
 
 
@@ -173,6 +175,8 @@ def ratios(found: Mapping[tuple[str, str], Scores]) -> dict[str, dict[str, Any]]
                 horizon = float(metric[:-1].rsplit("_", 1)[1]) if metric[-1] == "s" else 3.0
             above, below = ours.values(key, folds, mine, horizon), other.values(key, folds, theirs, horizon)
             if not (np.isfinite(above) & np.isfinite(below)).any():
+                continue
+            if float(np.nanmean(below)) < SMALLEST:
                 continue
             interval = ratio_interval(above, below)
             both = np.isfinite(above).all(axis=0) & np.isfinite(below).all(axis=0)

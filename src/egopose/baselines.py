@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -75,7 +76,7 @@ def run_baseline(
             int(config["seed"]),
             int(training["total_steps"]),
             None if training["max_seconds"] is None else float(training["max_seconds"]),
-            lambda work: _save(work, learner.model, config, folder),
+            _Saver(config, folder),
             saved,
             stop,
         )
@@ -99,16 +100,26 @@ def _score(result: FitResult) -> float:
     return -result.held_out if math.isfinite(result.held_out) else 0.0
 
 
-def _save(work: Fit, model: nn.Module, config: Mapping[str, Any], folder: Path) -> None:
-    """A checkpoint of the training, named after the frames learned from."""
-    frames, kept = work.result.frames, checkpoints.rotation(folder, keep_last=2)
-    if (folder / checkpoints.FOLDER / f"checkpoint-{frames}").exists():
-        return
-    component = checkpoints.ComponentState(work.state, lambda _: None)
-    metadata = checkpoints.metadata_of(f"baseline {_kind(config)}", 0, work.result.steps, frames, _score(work.result))
-    kept.save(
-        checkpoints.RunCheckpoint({"training": component, "config": dict(config)}), step=frames, metadata=metadata
-    )
+class _Saver:
+    """Checkpoints of a training, named after the frames learned from: one every minute and one at the end."""
+
+    every = 60.0
+
+    def __init__(self, config: Mapping[str, Any], folder: Path) -> None:
+        self.config, self.folder, self.last = config, folder, time.monotonic()
+
+    def __call__(self, work: Fit) -> None:
+        result = work.result
+        if not result.reason and time.monotonic() - self.last < self.every:
+            return
+        if (self.folder / checkpoints.FOLDER / f"checkpoint-{result.frames:012d}").exists():
+            return
+        component = checkpoints.ComponentState(work.state, lambda _: None)
+        made = checkpoints.RunCheckpoint({"training": component, "config": dict(self.config)})
+        kind = f"baseline {_kind(self.config)}"
+        metadata = checkpoints.metadata_of(kind, 0, result.steps, result.frames, _score(result))
+        checkpoints.rotation(self.folder, keep_last=2).save(made, step=result.frames, metadata=metadata)
+        self.last = time.monotonic()
 
 
 def _save_model(model: nn.Module, config: Mapping[str, Any], folder: Path, result: FitResult) -> None:
