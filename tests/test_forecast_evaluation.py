@@ -15,9 +15,12 @@ from env_stand_in import Piece, group
 
 from egopose import pipeline
 from egopose.data.reference import reference_states
+from egopose.envs.mdp.observations import humanoid_state
 from egopose.envs.problem import TakeTable
 from egopose.errors import InputError
+from egopose.evaluation.forecasting import ForecastWindow
 from egopose.evaluation.report import TakeVideo
+from egopose.forecast_contexts import _states, context_material, past_states
 from egopose.forecast_evaluation import run_forecast_evaluation
 from egopose.humanoid.config import HumanoidConfig, SimConfig
 from egopose.humanoid.model import build_humanoid
@@ -39,9 +42,11 @@ EVALUATE: dict[str, Any] = {
         "level": 0.8,
         "noise_time": 0.3,
         "start": "reference",
+        "estimator": None,
         "worlds": 10,
         "seed": 0,
     },
+    "failsafe": {"mode": "value", "kappa": 0.6, "fallen_height": 0.3},
     "interval": {"level": 0.95, "draws": 50, "seed": 0},
     "video": {"takes": 1, "size": 64},
     "threads": 1,
@@ -139,11 +144,45 @@ def test_bad_settings_are_named(agent: pipeline.Agent, tmp_path: Path) -> None:
             run_forecast_evaluation(settings, [agent], ["a", "b"], [None, None], tmp_path)
 
     fails("at most 31", horizon=60)
-    fails("regressor or reference", start="somewhere")
+    fails("one of regressor", start="somewhere")
     fails("none", start="regressor")
+    fails("estimation policy", start="estimator")
     fails("at least 1", samples=0)
     with pytest.raises(InputError, match="split"):
         run_forecast_evaluation({**EVALUATE, "split": "all"}, [agent], ["a", "b"], [None, None], tmp_path)
+
+
+def test_contexts_become_takes_by_themselves(agent: pipeline.Agent) -> None:
+    whole = agent.material
+    frames = torch.cat([torch.arange(4, 9), torch.arange(40, 45)])
+    names = ("visual_features", "visual_context", "joint_targets", "humanoid_state")
+    seen = {name: torch.arange(10.0)[:, None].repeat(1, 3) for name in names}
+    material = context_material(whole, [4, 40], CONTEXT, seen)
+    assert material.takes.offsets.tolist() == [0, 5]
+    assert material.takes.lengths.tolist() == [5, 5]
+    assert torch.equal(material.reference["qpos"], whole.reference["qpos"][frames])
+    lowest = [float(whole.reference["xpos"][rows, whole.humanoid.head, 2].min()) for rows in frames.split(5)]
+    assert material.takes.lowest_head_height.tolist() == pytest.approx(lowest)
+    assert [(f.take, f.start, f.stop) for f in material.test] == [(0, 0, 5), (1, 0, 5)]
+    assert material.states is seen["humanoid_state"]
+
+
+def test_true_contexts_are_the_references_states(agent: pipeline.Agent) -> None:
+    windows = [ForecastWindow(0, 4, CONTEXT, 12), ForecastWindow(1, 0, CONTEXT, 12)]
+    states = past_states(agent, windows, "reference")
+    every = humanoid_state(agent.material.reference)
+    assert torch.equal(states, torch.stack([every[4:9], every[40:45]]))
+
+
+def test_where_the_fail_safe_moved_the_body_its_velocity_is_the_regressors(agent: pipeline.Agent) -> None:
+    qpos = agent.material.reference["qpos"][:6].numpy()
+    dofs = qpos.shape[1] - 7
+    regressed = torch.full((6, 11 + 2 * dofs), 7.0, dtype=torch.float64)
+    plain = _states(qpos, np.zeros(6, dtype=bool), regressed, 30.0)
+    states = _states(qpos, np.array([0, 0, 1, 0, 0, 1], dtype=bool), regressed, 30.0)
+    assert (states[[1, 4, 5], 5 + dofs :] == 7.0).all()
+    assert torch.equal(states[:, : 5 + dofs], plain[:, : 5 + dofs])
+    assert torch.equal(states[[0, 2, 3]], plain[[0, 2, 3]])
 
 
 def test_states_of_a_context_know_nothing_of_what_follows() -> None:

@@ -13,22 +13,20 @@ from torch import Tensor
 
 from egopose.baselines import forecast_qpos, load_baseline
 from egopose.config import from_mapping
-from egopose.data.preparation import flow_name, store_folder
-from egopose.data.store import TakeStore
 from egopose.envs.starts import FragmentLike
 from egopose.errors import InputError
 from egopose.evaluation import forecast_report as report
 from egopose.evaluation import tables
 from egopose.evaluation.forecasting import ForecastWindow, forecast_windows, score_forecasts, true_futures
 from egopose.evaluation.report import RENDERED_NOTE, TakeVideo, file_name, write_motion_files
+from egopose.forecast_contexts import SOURCES, past_states
 from egopose.inference.bands import Bands, fit_scale, quantile_bands
-from egopose.inference.context_states import context_states
+from egopose.inference.failsafe import FailSafeSettings
 from egopose.inference.forecaster import Forecasts, forecast, placed_states
 from egopose.material import Material
 from egopose.models.baselines.recurrent import RecurrentForecaster
 from egopose.motion.motion import Motion
 from egopose.motion.rotations import Array
-from egopose.regression import load_regressor
 
 if TYPE_CHECKING:
     from egopose.pipeline import Agent
@@ -46,8 +44,8 @@ class ForecastSettings:
         samples: drawn futures a window; 1 for none.
         level: of the error bands.
         noise_time: s, see :func:`egopose.inference.forecaster.forecast`.
-        start: where forecasts begin: ``regressor`` (the state regressor on the context alone) or ``reference`` (the
-            true state, as in training).
+        start: where forecasts begin, one of :data:`egopose.forecast_contexts.SOURCES`.
+        estimator: run directory of an estimation policy, read by ``start`` ``estimator``.
         worlds: simulated side by side.
         seed: of the drawn futures.
     """
@@ -58,14 +56,14 @@ class ForecastSettings:
     level: float
     noise_time: float
     start: str
+    estimator: str | None
     worlds: int
     seed: int
 
     def __post_init__(self) -> None:
-        if self.start not in ("regressor", "reference"):
-            raise InputError(
-                "conf/evaluate.yaml", "forecast.start", f"must be regressor or reference, not {self.start}"
-            )
+        if self.start not in SOURCES:
+            cause = f"must be one of {', '.join(SOURCES)}, not {self.start!r}"
+            raise InputError("conf/evaluate.yaml", "forecast.start", cause)
         for name in ("every", "samples", "worlds"):
             if getattr(self, name) < 1:
                 raise InputError("conf/evaluate.yaml", f"forecast.{name}", "must be at least 1")
@@ -103,11 +101,13 @@ def run_forecast_evaluation(
     hands = [int(d) for d in humanoid.hand_dofs]
 
     methods: dict[str, list[Any]] = {OURS: [], DRAWN: [], STILL: []}
-    for name, run in compared.items():
-        methods[name] = [score_forecasts(truth, windows, _baseline_futures(agents[0], windows, str(run)), hands, fps)]
     coverage, futures = [], []
-    for agent in agents:
-        states = start_states(agent, windows, settings)
+    for number, agent in enumerate(agents):
+        pasts = _pasts(config, agent, windows, settings)
+        for name, run in compared.items() if number == 0 else ():
+            told = _baseline_futures(agent, windows, pasts, str(run))
+            methods[name] = [score_forecasts(truth, windows, told, hands, fps)]
+        states = _starts(agent, windows, pasts)
         mean = forecast_windows_of(agent, windows, states, 1, settings, int(config["threads"]))
         methods[OURS].append(score_forecasts(truth, windows, mean.qpos, hands, fps))
         still = states[0].numpy()[:, None, None].repeat(windows[0].horizon, axis=2)
@@ -116,7 +116,7 @@ def run_forecast_evaluation(
         if settings.samples > 1:
             drawn = forecast_windows_of(agent, windows, states, settings.samples, settings, int(config["threads"]))
             methods[DRAWN].append(score_forecasts(truth, windows, drawn.qpos, hands, fps))
-            bands, found = _bands(agent, drawn.qpos, truth, settings, int(config["threads"]), hands)
+            bands, found = _bands(config, agent, drawn.qpos, truth, settings, hands)
             coverage.append(found)
         futures.append((mean, drawn, bands))
     methods = {name: runs for name, runs in methods.items() if runs}
@@ -170,37 +170,26 @@ def windows_of(agent: Agent, split: str, settings: ForecastSettings) -> list[For
     return windows
 
 
-def start_states(agent: Agent, windows: Sequence[ForecastWindow], settings: ForecastSettings) -> tuple[Tensor, Tensor]:
-    """qpos ``[W, nq]`` and qvel ``[W, nv]`` at each window's last frame seen.
-
-    Raises:
-        InputError: the run's state regressor or the flow it reads is not there.
-    """
-    material, offsets = agent.material, agent.material.takes.offsets.tolist()
-    now = torch.tensor([offsets[w.take] + w.now for w in windows])
-    reference = {key: torch.as_tensor(material.reference[key][now]).double() for key in ("qpos", "qvel")}
-    if settings.start == "reference":
-        return reference["qpos"], reference["qvel"]
-    states = regressed_contexts(agent, windows)[:, -1].double().numpy()
-    return placed_states(states, reference["qpos"].numpy(), np.asarray(material.humanoid.joint_range))
+def _pasts(
+    config: Mapping[str, Any], agent: Agent, windows: Sequence[ForecastWindow], settings: ForecastSettings
+) -> Tensor:
+    """:func:`egopose.forecast_contexts.past_states` as ``conf/evaluate.yaml`` says, some windows at a time."""
+    failsafe = from_mapping(FailSafeSettings, config["failsafe"], "conf/evaluate.yaml: failsafe")
+    parts = [windows[at : at + settings.worlds] for at in range(0, len(windows), settings.worlds)]
+    threads = int(config["threads"])
+    return torch.cat([past_states(agent, p, settings.start, settings.estimator, failsafe, threads) for p in parts])
 
 
-def regressed_contexts(agent: Agent, windows: Sequence[ForecastWindow]) -> Tensor:
-    """:func:`egopose.inference.context_states.context_states` of the run's state regressor: z ``[W, context, S]``.
-
-    Raises:
-        InputError: the run's state regressor or the flow it reads is not there.
-    """
-    if agent.material.regressor is None:
-        raise InputError(agent.path, "regressor", "forecasts begin from the state regressor's state, and there is none")
-    model, _ = load_regressor(agent.material.regressor)
-    flow = TakeStore.open(store_folder(agent.config)).flow(flow_name(agent.config))
-    offsets = agent.material.takes.offsets.tolist()
-    return context_states(model, flow, [offsets[w.take] + w.start for w in windows], windows[0].context)
+def _starts(agent: Agent, windows: Sequence[ForecastWindow], pasts: Tensor) -> tuple[Tensor, Tensor]:
+    """The last states of ``pasts [W, context, S]`` where the reference stands and faces: qpos and qvel."""
+    material = agent.material
+    now = torch.tensor([int(material.takes.offsets[w.take]) + w.now for w in windows])
+    where = torch.as_tensor(material.reference["qpos"][now]).double().numpy()
+    return placed_states(pasts[:, -1].numpy(), where, np.asarray(material.humanoid.joint_range))
 
 
-def _baseline_futures(agent: Agent, windows: Sequence[ForecastWindow], run: str) -> Array:
-    """``[W, 1, H, nq]`` of a trained recurrent baseline, from the same regressor's poses of the same contexts.
+def _baseline_futures(agent: Agent, windows: Sequence[ForecastWindow], pasts: Tensor, run: str) -> Array:
+    """``[W, 1, H, nq]`` of a trained recurrent baseline that has seen ``pasts [W, context, S]``.
 
     Raises:
         InputError: the run is not one of a recurrent baseline of the same humanoid.
@@ -208,7 +197,7 @@ def _baseline_futures(agent: Agent, windows: Sequence[ForecastWindow], run: str)
     model = load_baseline(run).model
     if not isinstance(model, RecurrentForecaster):
         raise InputError(run, "baseline", "forecasts nothing; name runs of baseline=erd or aclstm")
-    return forecast_qpos(model, regressed_contexts(agent, windows), agent.material, windows)[:, None]
+    return forecast_qpos(model, pasts, agent.material, windows)[:, None]
 
 
 def forecast_windows_of(
@@ -243,13 +232,19 @@ def _truth(material: Material, windows: Sequence[ForecastWindow]) -> Array:
 
 
 def _bands(
-    agent: Agent, drawn: Array, truth: Array, settings: ForecastSettings, threads: int, hands: list[int]
+    config: Mapping[str, Any],
+    agent: Agent,
+    drawn: Array,
+    truth: Array,
+    settings: ForecastSettings,
+    hands: list[int],
 ) -> tuple[Bands, dict[str, Any]]:
     """Bands of the joints, calibrated on windows of the training takes, and how often the truth is inside."""
     used = [7 + d for d in range(drawn.shape[-1] - 7) if d not in hands]
     bands = quantile_bands(drawn[..., used], settings.level)
     kept = windows_of(agent, "train", settings)
-    futures = forecast_windows_of(agent, kept, start_states(agent, kept, settings), settings.samples, settings, threads)
+    states = _starts(agent, kept, _pasts(config, agent, kept, settings))
+    futures = forecast_windows_of(agent, kept, states, settings.samples, settings, int(config["threads"]))
     known = quantile_bands(futures.qpos[..., used], settings.level)
     known_truth = _truth(agent.material, kept)[..., used]
     scale = fit_scale(known, known_truth, settings.level)
