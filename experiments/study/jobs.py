@@ -21,9 +21,11 @@ from egopose.evaluation.agents import evaluate_agent
 from egopose.evaluation.forecasting import ForecastWindow, forecast_windows, score_forecasts, true_futures
 from egopose.evaluation.protocols import METRICS, ContactSettings, TakeScores, score_take
 from egopose.evaluation.tables import write_json
-from egopose.forecast_evaluation import ForecastSettings, forecast_windows_of, start_states, windows_of
+from egopose.forecast_contexts import past_states
+from egopose.forecast_evaluation import ForecastSettings, forecast_windows_of, windows_of
 from egopose.inference.context_states import context_states
 from egopose.inference.failsafe import FailSafeSettings
+from egopose.inference.forecaster import placed_states
 from egopose.material import Material, absolute_paths, load_material, run_material
 from egopose.models.baselines.path_pose import PathPose
 from egopose.models.baselines.recurrent import RecurrentForecaster
@@ -150,12 +152,17 @@ def _forecasts(
     job: Job, folder: Path, config: dict[str, Any], judged: dict[str, Any], settings: dict[str, Any]
 ) -> Result:
     """Figures of every held-out take by horizon: ``figures[metric][take][horizon]``, ``horizons`` in seconds."""
-    forecast = from_mapping(ForecastSettings, settings["forecast"], "conf/evaluate.yaml: forecast")
+    own = {key: value for key, value in settings["forecast"].items() if key != "baselines"}
+    forecast = from_mapping(ForecastSettings, own, "conf/evaluate.yaml: forecast")
     if job.verb == "train":
         agent = load_agent(folder, which="latest")
         material = agent.material
         windows = windows_of(agent, "test", forecast)
-        states = start_states(agent, windows, forecast)
+        # As the baselines: what the run's own state regressor sees in the contexts alone.
+        pasts = past_states(agent, windows, "regressor")
+        now = torch.tensor([int(material.takes.offsets[w.take]) + w.now for w in windows])
+        where = torch.as_tensor(material.reference["qpos"][now]).double().numpy()
+        states = placed_states(pasts[:, -1].numpy(), where, material.humanoid.joint_range)
         futures = forecast_windows_of(agent, windows, states, 1, forecast, int(settings["threads"])).qpos
     else:
         material = _material(folder, config, judged)
