@@ -165,20 +165,18 @@ def test_ratios_are_those_worked_out_by_hand(tmp_path: Path) -> None:
     assert "0.667 [" in shown
 
 
-def test_results_of_other_takes_or_budgets_are_not_compared(tmp_path: Path) -> None:
+def test_results_of_other_takes_or_smaller_budgets_are_not_compared(tmp_path: Path, capsys) -> None:
     from tables import write_tables
 
-    raw(tmp_path, "ours", "a", 0, {"E_pose": [1.0], "E_vel": [1], "A_accl": [1]})
-    raw(tmp_path, "posereg", "a", 0, {"E_pose": [1.0, 2.0], "E_vel": [1, 1], "A_accl": [1, 1]})
+    one = {"E_pose": [1.0], "E_vel": [1], "A_accl": [1]}
+    raw(tmp_path, "ours", "a", 0, one)
+    raw(tmp_path, "vgail", "a", 0, {key: [1.0, 2.0] for key in one})
     with pytest.raises(InputError, match="other takes"):
         write_tables(tmp_path)
-    raw(
-        tmp_path,
-        "posereg",
-        "a",
-        0,
-        {"E_pose": [1.0], "E_vel": [1], "A_accl": [1]},
-        overrides=["training.total_steps=9"],
-    )
-    with pytest.raises(InputError, match="budget"):
+    raw(tmp_path, "vgail", "a", 0, one, overrides=["training.total_steps=9"])
+    raw(tmp_path, "posereg", "a", 0, one, overrides=[])
+    assert {name.rsplit("/", 1)[1] for name in write_tables(tmp_path)} == {"posereg"}
+    assert "left out: vgail-a-0.json had 9 of 100" in capsys.readouterr().err
+    (tmp_path / "table1_estimation" / "raw" / "vgail-a-0.json").write_text('{"overrides": []}')
+    with pytest.raises(InputError, match="damaged"):
         write_tables(tmp_path)

@@ -74,6 +74,8 @@ PAPER_HORIZONS = {
     "erd": (1.239, 1.309, 1.374, 1.521, 1.619),
     "aclstm": (1.299, 1.297, 1.314, 1.425, 1.511),
 }
+#: In a raw result's overrides; PoseReg has none.
+BUDGET = "training.total_steps="
 #: Nothing is divided by less: a method that stands still has no acceleration.
 SMALLEST = 1e-6
 METRICS = {"e_pose": "E_pose", "e_vel": "E_vel", "a_accl": "A_accl", "e_key": "E_key"}
@@ -117,24 +119,30 @@ def _column(result: Mapping[str, Any], metric: str, horizon: float | None) -> li
 def gather(results: Path) -> dict[tuple[str, str], Scores]:
     """All raw results by protocol and method.
 
+    Of a study under way to a larger budget, those that have come to it; the others are named on standard error.
+
     Raises:
-        InputError: a file is damaged, or kinematic and physical methods had different budgets.
+        InputError: a file is damaged.
     """
-    found: dict[tuple[str, str], dict[str, dict[int, Any]]] = defaultdict(lambda: defaultdict(dict))
-    budgets: dict[str, str] = {}
+    raw: list[tuple[Path, Mapping[str, Any], int | None]] = []
     for table in (ESTIMATION, ABLATIONS, HORIZONS):
         for path in sorted((results / table / "raw").glob("*.json")):
             result = read_json(path, "raw result")
             try:
-                key, fold, seed = (result["protocol"], result["method"]), result["fold"], int(result["seed"])
-                words = [w for w in result["overrides"] if w.startswith("training.total_steps=")]
+                words = [w for w in result["overrides"] if w.startswith(BUDGET)]
+                budget = int(words[-1].removeprefix(BUDGET)) if words else None
+                int(result["seed"]), result["protocol"], result["method"], result["fold"]
                 result["takes"], result["figures"]
             except (KeyError, TypeError, ValueError, AttributeError) as error:
                 raise InputError(path, "raw result", f"is damaged: {error!r}") from None
-            budgets |= dict.fromkeys(words, path.name)
-            found[key][fold][seed] = result
-    if len(budgets) > 1:
-        raise InputError(results, "budget", f"differs between raw results: {budgets}")
+            raw.append((path, result, budget))
+    largest = max((budget for _, _, budget in raw if budget is not None), default=None)
+    found: dict[tuple[str, str], dict[str, dict[int, Any]]] = defaultdict(lambda: defaultdict(dict))
+    for path, result, budget in raw:
+        if budget not in (None, largest):
+            print(f"left out: {path.name} had {budget} of {largest} steps", file=sys.stderr)
+            continue
+        found[result["protocol"], result["method"]][result["fold"]][int(result["seed"])] = result
     return {key: Scores(folds) for key, folds in found.items()}
 
 
