@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,7 @@ from egopose.data.reference import reference_states
 from egopose.envs.mdp.observations import humanoid_state
 from egopose.envs.problem import TakeTable
 from egopose.errors import InputError
+from egopose.estimate import require_estimation
 from egopose.evaluation.forecasting import ForecastWindow
 from egopose.evaluation.report import TakeVideo
 from egopose.forecast_contexts import _states, context_material, past_states
@@ -183,6 +185,15 @@ def test_where_the_fail_safe_moved_the_body_its_velocity_is_the_regressors(agent
     assert (states[[1, 4, 5], 5 + dofs :] == 7.0).all()
     assert torch.equal(states[:, : 5 + dofs], plain[:, : 5 + dofs])
     assert torch.equal(states[[0, 2, 3]], plain[[0, 2, 3]])
+
+
+def test_a_run_that_forecasts_does_not_estimate(agent: pipeline.Agent, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="this run forecasts"):
+        require_estimation(agent.config, "run")
+    other = replace(agent, config={**agent.config, "task": group("task", "estimation")})
+    require_estimation(other.config, "run")
+    with pytest.raises(InputError, match="does not forecast"):
+        run_forecast_evaluation(EVALUATE, [agent, other], ["a", "b"], [None, None], tmp_path)
 
 
 def test_states_of_a_context_know_nothing_of_what_follows() -> None:

@@ -106,6 +106,12 @@ def seen_live(
     return {"visual_features": features, **{key: torch.stack([getattr(row, key) for row in rows]) for key in keys}}
 
 
+def require_estimation(run: Mapping[str, Any], checkpoint: str | Path) -> None:
+    """Raises InputError: the configuration ``run`` of a checkpoint is of a policy that forecasts."""
+    if run["task"].get("context") is not None:
+        raise InputError(checkpoint, "task", "this run forecasts; an estimation policy is needed here")
+
+
 def video_material(humanoid: HumanoidModel, seen: Mapping[str, Tensor], name: str) -> tuple[Material, Motion]:
     """What the policy needs of a video: a take whose reference is what the state regressor makes of it by itself.
 
@@ -238,6 +244,7 @@ def estimate_video(values: Mapping[str, Any]) -> Path:
     out = video.with_name(f"{video.stem}_estimate") if values["out"] is None else Path(str(values["out"]))
     checkpoint = find_checkpoint(str(values["checkpoint"]), str(values["which"]))
     run = read_json(checkpoint, "config")
+    require_estimation(run, checkpoint)
     humanoid = humanoid_of(run)
     regressor, made_with = load_regressor(run_folder(checkpoint) / "regressor")
     lookahead = allowed_lookahead(values)

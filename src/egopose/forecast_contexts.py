@@ -20,7 +20,7 @@ from egopose.data.store import Fragment, TakeStore
 from egopose.envs.mdp.observations import humanoid_state
 from egopose.envs.problem import TakeTable
 from egopose.errors import InputError
-from egopose.estimate import seen_in
+from egopose.estimate import require_estimation, run_folder, seen_in
 from egopose.evaluation.forecasting import ForecastWindow
 from egopose.inference.context_states import context_states
 from egopose.inference.estimator import estimate_takes
@@ -29,7 +29,7 @@ from egopose.material import Material
 from egopose.motion.motion import finite_difference
 from egopose.motion.rotations import Array
 from egopose.regression import load_regressor
-from egopose.training.checkpoint import find_checkpoint
+from egopose.training.checkpoint import find_checkpoint, read_json
 
 if TYPE_CHECKING:
     from egopose.pipeline import Agent
@@ -83,13 +83,14 @@ def _estimated(
 ) -> Tensor:
     from egopose.pipeline import load_agent
 
-    run = find_checkpoint(estimator).resolve().parent.parent
-    model, made_with = load_regressor(run / "regressor")
+    checkpoint = find_checkpoint(estimator)
+    require_estimation(read_json(checkpoint, "config"), checkpoint)
+    model, made_with = load_regressor(run_folder(checkpoint) / "regressor")
     flow, humanoid = _flow(agent), agent.material.humanoid
     found = [seen_in(humanoid, model, np.asarray(flow[at : at + context]), made_with) for at in first]
     seen = {key: torch.cat([clip[key] for clip in found]) for key in found[0]}
     material = context_material(agent.material, first, context, seen)
-    policy = load_agent(estimator, material)
+    policy = load_agent(checkpoint, material)
     env = policy.make_env(worlds=len(first), threads=threads, whole_fragments=True, falls_end=False)
     guard = FailSafe(len(first), failsafe)
     estimates = estimate_takes(env, policy.actor, policy.critic, policy.followed_states(), guard)

@@ -93,6 +93,9 @@ def run_forecast_evaluation(
     values = dict(config["forecast"])
     compared = dict(values.pop("baselines", None) or {})
     settings = from_mapping(ForecastSettings, values, "conf/evaluate.yaml: forecast")
+    for agent in agents:
+        if agent.config["task"].get("context") is None:
+            raise InputError(agent.path, "task", "this run does not forecast, others of these do")
     material, split = agents[0].material, str(config["split"])
     humanoid, fps = material.humanoid, 1.0 / material.humanoid.control_dt
     windows = windows_of(agents[0], split, settings)
