@@ -38,7 +38,6 @@ class LivePose:
     Attributes:
         frame: control frames since the stream's start.
         qpos: ``[nq]``.
-        action: ``[nu]`` that led here; None where the body was placed.
         value: V of the state at the frame before, from which the step here was decided; None at the first frame.
         confidence: that value over its running mean, see :class:`FailSafe`.
         reset: placed where the regressor sees it, because the fail-safe triggered or the physics broke.
@@ -46,7 +45,6 @@ class LivePose:
 
     frame: int
     qpos: Array
-    action: Array | None
     value: float | None
     confidence: float | None
     reset: bool
@@ -119,7 +117,7 @@ class LiveBody:
             origin[0, 3] = 1.0
             self._place(seen, origin)
             self._lap("physics")
-            return LivePose(seen.frame, self._physics.qpos[0].copy(), None, None, None, False)
+            return LivePose(seen.frame, self._physics.qpos[0].copy(), None, None, False)
         body = self._physics.body_state()
         observation = self._observe(before, seen)
         with set_exploration_type(ExplorationType.DETERMINISTIC):
@@ -137,8 +135,7 @@ class LiveBody:
         diverged = bool(self._physics.step(target.numpy())[0])
         if reset := triggered or diverged:
             self._place(seen, body["qpos"])
-        action = None if reset else observation["action"][0].numpy()
-        pose = LivePose(seen.frame, self._physics.qpos[0].copy(), action, float(value), float(confidence), reset)
+        pose = LivePose(seen.frame, self._physics.qpos[0].copy(), float(value), float(confidence), reset)
         self._lap("physics")
         return pose
 

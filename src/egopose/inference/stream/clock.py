@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-# A frame less than this share of a control frame ahead is taken for the same one; lower than a half, so that a camera
-# at the control rate whose stamps waver is not now doubled, now skipped.
+# A frame less than this share of a control frame ahead is taken for the same one, and one that much short of a further
+# control frame for that one. Far from a half, so that a camera at the control rate whose stamps waver is not now
+# doubled, now left out: after either its frames lie half a control frame from both bounds.
 _SAME = 0.25
 
 
@@ -27,6 +28,6 @@ class ControlClock:
         ahead = (time - self._due) * self._rate
         if ahead < _SAME:
             return 0
-        count = max(round(ahead), 1)
+        count = max(int(ahead + _SAME), 1)
         self._due += count / self._rate
         return count

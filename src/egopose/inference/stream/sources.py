@@ -22,6 +22,8 @@ from egopose.vision.video import MAX_PIXELS, MAX_SIDE, Frame, iter_frames, probe
 #: Addresses that are opened. FFmpeg knows further ones that read files or run over other protocols.
 SCHEMES = ("rtsp", "rtsps", "rtmp", "http", "https", "udp", "tcp", "srt")
 
+_OPTIONS = "OPENCV_FFMPEG_CAPTURE_OPTIONS"
+
 # A play list found at an address may name further ones; only these are followed, and never a file.
 _FOLLOWED = "http,https,tls,tcp,udp,rtp,rtsp,rtmp,srt,crypto"
 
@@ -141,10 +143,16 @@ def _open_camera(number: str) -> cv2.VideoCapture:
 
 
 def _open_address(address: str) -> cv2.VideoCapture:
-    # OpenCV takes FFmpeg's options from the environment alone; what a user has set there wins.
-    os.environ.setdefault("OPENCV_FFMPEG_CAPTURE_OPTIONS", f"protocol_whitelist;{_FOLLOWED}")
     limits = [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, _OPEN_TIMEOUT_MS, cv2.CAP_PROP_READ_TIMEOUT_MSEC, _READ_TIMEOUT_MS]
-    return cv2.VideoCapture(address, cv2.CAP_FFMPEG, limits)
+    # OpenCV takes FFmpeg's options from the environment alone, for files too: what a user has set there wins, and
+    # nothing stays.
+    given = os.environ.get(_OPTIONS)
+    os.environ[_OPTIONS] = f"protocol_whitelist;{_FOLLOWED}" if given is None else given
+    try:
+        return cv2.VideoCapture(address, cv2.CAP_FFMPEG, limits)
+    finally:
+        if given is None:
+            del os.environ[_OPTIONS]
 
 
 def _rgb(picture: cv2.typing.MatLike, source: str) -> Frame:

@@ -1,0 +1,61 @@
+"""An untrained run in memory and a moving picture, for the tests of live estimation."""
+
+from __future__ import annotations
+
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from env_stand_in import group
+
+from egopose.config import from_mapping
+from egopose.data.preparation import humanoid_of
+from egopose.pipeline import build_env, build_networks
+from egopose.stream import Trained, two_frames
+from egopose.training.fragments import Span
+from egopose.training.regressor_settings import RegressorSettings
+from egopose.training.supervised import build_regressor
+from egopose.vision.encoders import build_encoder
+from egopose.vision.video import write_video
+
+
+@cache
+def run_config(model: str, task: str, cross_fit: int = 1, smoothing: float = 0.0) -> dict[str, Any]:
+    settings = group("task", task)
+    return {
+        "task": {**settings, "action": {**settings["action"], "smoothing": smoothing}},
+        "reward": group("reward", "estimation"),
+        "humanoid": group("humanoid", "default"),
+        "sim": group("sim", "fast"),
+        "vision": group("vision", "light"),
+        "regressor": {**group("regressor", "fast"), "cross_fit": cross_fit},
+        "model": group("model", model),
+        "algo": {},
+    }
+
+
+def untrained(model: str = "fast", task: str = "residual", cross_fit: int = 1, smoothing: float = 0.0) -> Trained:
+    config = run_config(model, task, cross_fit, smoothing)
+    torch.manual_seed(0)
+    humanoid = humanoid_of(config)
+    # Around standing, with so much spread that what is seen makes a difference.
+    states = 0.3 * torch.randn(300, 2 * humanoid.mj_model.nq - 3)
+    states[:, 0], states[:, 1] = 0.95, 1.0
+    encoder = build_encoder(config["vision"]["encoder"])
+    settings = from_mapping(RegressorSettings, config["regressor"], "conf/regressor")
+    regressor = build_regressor(encoder, states, [Span(0, len(states))], settings, encoder.features).eval()
+    made_with = {"vision": config["vision"], "regressor": config["regressor"]}
+    material = two_frames(humanoid, regressor, made_with)
+    env = build_env(config, material, "test", worlds=1, whole_fragments=True, falls_end=False)
+    actor, critic = build_networks(config, material, env)
+    return Trained(humanoid, regressor, made_with, env, actor.eval(), critic.eval(), config)
+
+
+def write_walk(path: Path, frames: int, fps: float = 30.0) -> Path:
+    """A textured plane that passes by at a wavering speed."""
+    texture = np.random.default_rng(0).integers(0, 255, (120, 400, 3)).astype(np.uint8)
+    shifts = np.cumsum(2 + 2 * np.sin(np.arange(frames) / 4)).astype(int) % 250
+    write_video(path, [texture[:, at : at + 128] for at in shifts], fps)
+    return path
