@@ -226,7 +226,8 @@ def test_amass_holds_rotations_exactly(humanoid: HumanoidModel, moving: Motion, 
         write_motion(Motion(Skeleton((Joint("a", -1, (0, 0, 0)),)), np.eye(7)[3:4], FPS), tmp_path / "x.amass.npz")
 
 
-def test_opensim_reads_its_files(moving: Motion, tmp_path: Path) -> None:
+def test_opensim_reads_its_files(moving: Motion, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)  # it writes its log where it stands
     opensim = pytest.importorskip("opensim", reason="OpenSim (280 MB) is not installed; `pip install opensim`")
     for ending in (".mot", ".forces.mot", ".torques.sto"):
         write_motion(moving, tmp_path / f"m{ending}")

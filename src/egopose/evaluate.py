@@ -6,6 +6,7 @@ from egopose.runtime import prepare_runtime
 
 prepare_runtime()
 
+import shlex  # noqa: E402
 import sys  # noqa: E402
 from collections.abc import Mapping, Sequence  # noqa: E402
 from dataclasses import dataclass  # noqa: E402
@@ -94,6 +95,7 @@ def run_evaluation(
         )
     rendered = any(v is not None and v.rendered for v in videos)
     about = {
+        "command": shlex.join(sys.orig_argv),
         "checkpoints": [str(agent.path) for agent in agents],
         "split": split,
         "rendered_video": rendered,
@@ -173,6 +175,10 @@ def main(config: DictConfig) -> None:
             print(run_forecast_evaluation(values, agents, names, videos, out), flush=True)
             return
         print(summary(run_evaluation(values, agents, names, videos, out)), flush=True)
+        if values["report"]:
+            from egopose.report import evaluation_report
+
+            print(f"report: {evaluation_report(out, agents[0].material.humanoid)}", flush=True)
     except InputError as error:
         print(f"error: {error}", file=sys.stderr)
         raise SystemExit(2) from None

@@ -70,12 +70,13 @@ def write_results(
 
 
 def write_take(folder: Path, result: FragmentResult) -> Path:
-    """``frames.csv``, ``estimate.bvh``, ``estimate.npz`` and ``reference.bvh`` in a folder of the take's name."""
+    """``frames.csv``, ``estimate`` and ``reference`` as BVH and npz, ``pose_regression.npz``, in the take's folder."""
     folder = folder / file_name(result.motion.name)
     folder.mkdir(parents=True, exist_ok=True)
     tables.write_columns_csv(folder / "frames.csv", {**result.scores.frames, **result.estimate.columns()})
     write_motion_files(folder, "estimate", result.motion)
-    write_motion(result.reference, folder / "reference.bvh")
+    write_motion_files(folder, "reference", result.reference)
+    write_motion(result.pose_regression, folder / "pose_regression.npz")
     return folder
 
 
