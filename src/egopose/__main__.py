@@ -14,6 +14,8 @@ VERBS = {
     "evaluate": "score a checkpoint on held-out takes beside PoseReg: tables, CSV, BVH, side-by-side MP4",
     "estimate": "motion from a video alone: BVH and MP4",
     "stream": "motion live from a camera, a video or an address: WebSocket, file, latencies",
+    "export": "motions for other programs: BVH, GLB, AMASS npz, TRC, C3D, OpenSim, CSV",
+    "report": "one HTML page of an evaluation or a sweep: tables, curves, pictures",
     "bench": "measure the environment's and the pipeline's speed",
 }
 
