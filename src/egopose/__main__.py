@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import importlib
 import sys
 
@@ -13,10 +14,11 @@ VERBS = {
     "baseline": "train a method that policies are compared with: ERD, acLSTM, PathPose",
     "evaluate": "score a checkpoint on held-out takes beside PoseReg: tables, CSV, BVH, side-by-side MP4",
     "estimate": "motion from a video alone: BVH and MP4",
-    "stream": "motion live from a camera, a video or an address: WebSocket, file, latencies",
     "export": "motions for other programs: BVH, GLB, AMASS npz, TRC, C3D, OpenSim, CSV",
     "report": "one HTML page of an evaluation or a sweep: tables, curves, pictures",
+    "stream": "motion live from a camera, a video or an address: WebSocket, file, latencies",
     "bench": "measure the environment's and the pipeline's speed",
+    "completion": "print the script that completes verbs and settings in bash or zsh",
 }
 
 
@@ -24,7 +26,8 @@ def usage() -> str:
     """The help text."""
     width = max(map(len, VERBS))
     verbs = "\n".join(f"  {verb.ljust(width)}  {what}" for verb, what in VERBS.items())
-    return f"usage: egopose VERB [key=value ...]\n\n{verbs}\n\negopose VERB --help says more of one."
+    more = 'egopose VERB --help says more of one; eval "$(egopose completion bash)" lets the shell complete them.'
+    return f"usage: egopose VERB [key=value ...]\n\n{verbs}\n\n{more}"
 
 
 def main() -> None:
@@ -35,7 +38,9 @@ def main() -> None:
         raise SystemExit(0 if arguments else 2)
     verb = arguments[0]
     if verb not in VERBS:
-        print(f"error: no verb {verb!r}\n{usage()}", file=sys.stderr)
+        near = difflib.get_close_matches(verb, VERBS, 1)
+        meant = f"; did you mean {near[0]}?" if near else ""
+        print(f"error: no verb {verb!r}{meant}\n\n{usage()}", file=sys.stderr)
         raise SystemExit(2)
     sys.argv = [f"egopose {verb}", *arguments[1:]]
     importlib.import_module(f"egopose.{verb}").main()
