@@ -368,13 +368,3 @@ def test_own_clip(change: dict[str, object], expected: str, tmp_path: Path) -> N
     for bad, cause in ((qpos[:, :5], "qpos must be"), (qpos * np.nan, "not finite"), (qpos.astype(int), "not float32")):
         path.write_bytes(archive(header=np.frombuffer(json.dumps(header).encode(), np.uint8), qpos=bad))
         blamed(path, cause)
-
-
-def test_big_files_read_fast(shared: Path) -> None:
-    path = shared / "data" / "cmu_bvh60" / "subjects" / "001" / "001_01.bvh"
-    best = float("inf")
-    for _ in range(3):
-        start = time.perf_counter()
-        assert len(read_motion(path)) == 1376
-        best = min(best, time.perf_counter() - start)
-    assert best < 0.3

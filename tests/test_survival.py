@@ -42,7 +42,7 @@ def killed(capsys: pytest.CaptureFixture[str], rounds: int, *overrides: str) -> 
 
 
 @linux
-@pytest.mark.parametrize("rounds", [5, pytest.param(50, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("rounds", [3, pytest.param(50, marks=pytest.mark.slow)])
 def test_killed_at_random_moments_it_ends_as_if_left_alone(rounds: int, capsys: pytest.CaptureFixture[str]) -> None:
     result = killed(capsys, rounds)
     assert (result["kills"], result["bit_equal"], result["curves_equal"]) == (rounds, True, True)
