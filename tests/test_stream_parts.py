@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
+from collections.abc import Iterator
 from functools import partial
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
@@ -155,22 +156,39 @@ def test_a_file_that_is_no_video_is_named(tmp_path: Path) -> None:
             check_source(SourceSettings(str(tmp_path / name), "every", False, 0.0))
 
 
-def test_an_address_is_read_as_a_camera(tmp_path: Path) -> None:
-    write_walk(tmp_path / "walk.mp4", 12)
+@pytest.fixture
+def site(tmp_path: Path) -> Iterator[str]:
+    """An address at which the files of ``tmp_path / "site"`` lie."""
+    (tmp_path / "site").mkdir()
 
     class Quiet(SimpleHTTPRequestHandler):
         def log_message(self, *args: object) -> None:
             pass
 
-    server = ThreadingHTTPServer(("127.0.0.1", 0), partial(Quiet, directory=str(tmp_path)))
+    server = ThreadingHTTPServer(("127.0.0.1", 0), partial(Quiet, directory=str(tmp_path / "site")))
     threading.Thread(target=server.serve_forever, daemon=True).start()
+    yield f"http://127.0.0.1:{server.server_address[1]}"
+    server.shutdown()
+    server.server_close()
+
+
+def test_a_play_list_leads_to_no_file(site: str, tmp_path: Path) -> None:
+    secret = write_walk(tmp_path / "secret.mp4", 12)
+    lines = ["#EXTM3U", "#EXT-X-TARGETDURATION:1", "#EXTINF:1,", f"file://{secret}", "#EXT-X-ENDLIST"]
+    (tmp_path / "site" / "list.m3u8").write_text("\n".join(lines))
+    concat = f"ffconcat version 1.0\nfile 'file://{secret}'\n"
+    (tmp_path / "site" / "list.ffconcat").write_text(concat)
+    for name in ("list.m3u8", "list.ffconcat"):
+        newest = NewestFrame()
+        capture(SourceSettings(f"{site}/{name}", "real_time", False, 0.0), 30.0, newest, threading.Event())
+        with pytest.raises(InputError, match="cannot be opened|gives no picture"):
+            newest.take(0.0)
+
+
+def test_an_address_is_read_as_a_camera(site: str, tmp_path: Path) -> None:
+    write_walk(tmp_path / "site" / "walk.mp4", 12)
     newest = NewestFrame()
-    address = f"http://127.0.0.1:{server.server_address[1]}/walk.mp4"
-    try:
-        capture(SourceSettings(address, "real_time", False, 0.0), 30.0, newest, threading.Event())
-    finally:
-        server.shutdown()
-        server.server_close()
+    capture(SourceSettings(f"{site}/walk.mp4", "real_time", False, 0.0), 30.0, newest, threading.Event())
     last = newest.take(0.0)
     assert last is not None
     assert last.image.shape == (120, 128, 3)
