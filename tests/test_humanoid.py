@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from importlib.resources import files
 from pathlib import Path
 
 import mujoco
@@ -11,13 +12,15 @@ import pytest
 from mocap import default_config, default_humanoid, rig_motion
 
 from egopose.config import compose_config
+from egopose.data.prepare_motion import reference_motion
 from egopose.errors import InputError
 from egopose.humanoid.config import HumanoidConfig, SimConfig
 from egopose.humanoid.from_motion import config_from_motion, humanoid_from_motion
 from egopose.humanoid.model import build_humanoid, sole_points
 from egopose.motion import rotations as rot
+from egopose.motion.io import read_motion
 from egopose.motion.kinematics import forward_kinematics
-from egopose.motion.motion import Motion
+from egopose.motion.motion import Motion, finite_difference
 from egopose.motion.retarget import retarget
 from egopose.motion.skeleton import Joint, Skeleton
 
@@ -304,3 +307,24 @@ def test_an_axis_that_is_no_direction_is_an_input_error() -> None:
     values["joints"][1]["axes"][0] = [0, 0, 0]
     with pytest.raises(InputError, match=r"joints\.Spine\.axes"):
         HumanoidConfig.from_mapping(values)
+
+
+def test_the_quicker_solver_moves_the_body_alike() -> None:
+    """A control step from frames of a real walk, soles on the floor: PGS and Newton within 1e-6 rad and m."""
+    clip = Path(str(files("egopose") / "assets" / "clips" / "cmu07_02.motion.npz"))
+    walk, _ = reference_motion(read_motion(clip), default_humanoid())
+    qvel = finite_difference(walk.qpos, walk.fps)
+    after = []
+    for solver in ("Newton", "PGS"):
+        humanoid = build_humanoid(default_config(), SimConfig(substeps=4, solver=solver))
+        data = mujoco.MjData(humanoid.mj_model)
+        moved = []
+        for frame in range(0, len(walk) - 1, 5):
+            mujoco.mj_resetData(humanoid.mj_model, data)
+            data.qpos[:], data.qvel[:], data.ctrl[:] = walk.qpos[frame], qvel[frame], walk.qpos[frame + 1, 7:]
+            mujoco.mj_step(humanoid.mj_model, data, humanoid.substeps)
+            moved.append(data.qpos.copy())
+        after.append(np.array(moved))
+    assert np.abs(after[0] - after[1]).max() < 1e-6
+    with pytest.raises(ValueError, match="Newton or PGS"):
+        SimConfig(solver="CG")

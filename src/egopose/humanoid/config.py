@@ -178,14 +178,23 @@ class SimConfig:
     Args:
         control_hz: the policy's rate.
         substeps: physics steps in one control step.
-        solver_iterations: most Newton iterations a step.
+        solver_iterations: most iterations of the constraint solver a step.
         tolerance: the solver's.
+        solver: MuJoCo's name of it: ``Newton`` or ``PGS``, the quicker where constraints are few.
+
+    Raises:
+        ValueError: another solver.
     """
 
     control_hz: float = 30.0
     substeps: int = 15
     solver_iterations: int = 100
     tolerance: float = 1e-8
+    solver: str = "Newton"
+
+    def __post_init__(self) -> None:
+        if self.solver not in ("Newton", "PGS"):
+            raise ValueError(f"solver must be Newton or PGS, not {self.solver!r}")
 
     @property
     def timestep(self) -> float:

@@ -145,6 +145,7 @@ def _document(config: HumanoidConfig, sim: SimConfig) -> mjcf.RootElement:
     root.option.integrator = "Euler"
     root.option.iterations = sim.solver_iterations
     root.option.tolerance = sim.tolerance
+    root.option.solver = sim.solver
     root.default.geom.contype = _BODY_BIT
     root.default.geom.conaffinity = _FLOOR_BIT
     root.default.geom.friction = config.friction
