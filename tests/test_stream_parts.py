@@ -181,7 +181,7 @@ def test_a_play_list_leads_to_no_file(site: str, tmp_path: Path) -> None:
     for name in ("list.m3u8", "list.ffconcat"):
         newest = NewestFrame()
         capture(SourceSettings(f"{site}/{name}", "real_time", False, 0.0), 30.0, newest, threading.Event())
-        with pytest.raises(InputError, match="cannot be opened|gives no picture"):
+        with pytest.raises(InputError, match=r"cannot be opened|gives no picture"):
             newest.take(0.0)
 
 
