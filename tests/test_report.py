@@ -15,7 +15,9 @@ import cv2
 import numpy as np
 import pytest
 from env_stand_in import group
+from hydra import compose, initialize_config_dir
 
+from egopose.config import compose_config, config_dir
 from egopose.errors import InputError
 from egopose.evaluation import page
 from egopose.evaluation.agents import FragmentResult
@@ -244,6 +246,12 @@ def test_neither_an_evaluation_nor_a_sweep(tmp_path: Path) -> None:
     (tmp_path / "0/curves.csv").write_text("steps,reward\n1,x\n")
     with pytest.raises(InputError, match="damaged"):
         run_report(tmp_path)
+
+
+def test_a_configuration_can_be_read_within_hydras_main() -> None:
+    with initialize_config_dir(str(config_dir()), version_base="1.3"):
+        assert compose_config("report")["out"] is None
+        assert compose("export").part == "estimate"  # Hydra's own instance is as it was
 
 
 def test_charts() -> None:

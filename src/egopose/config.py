@@ -16,6 +16,7 @@ from typing import Any, TypeVar, Union
 import hydra
 from hydra import compose, initialize_config_dir
 from hydra._internal.utils import get_args_parser
+from hydra.core.global_hydra import GlobalHydra
 from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
@@ -110,17 +111,22 @@ def convert(value: Any, kind: Any, source: str, field: str) -> Any:
 
 
 def compose_config(name: str, overrides: Sequence[str] = ()) -> dict[str, Any]:
-    """The resolved ``conf/NAME.yaml`` with overrides as on a command line, for use without Hydra's main.
+    """The resolved ``conf/NAME.yaml`` with overrides as on a command line, outside Hydra's main or within it.
 
     Raises:
         InputError: an override names no setting or choice, or a value is missing.
     """
     register_resolvers()
+    # Hydra's main has initialised its one instance, and a second one is refused.
+    running = GlobalHydra.instance().hydra
+    GlobalHydra.instance().clear()
     try:
         with initialize_config_dir(str(config_dir()), version_base="1.3"):
             return resolved(compose(name, list(overrides)))
     except HydraException as error:
         raise InputError(f"conf/{name}.yaml", "override", str(error).splitlines()[0]) from None
+    finally:
+        GlobalHydra.instance().hydra = running
 
 
 def check_arguments(arguments: Sequence[str]) -> None:
