@@ -16,7 +16,7 @@ from collections.abc import Mapping, Sequence  # noqa: E402
 from pathlib import Path  # noqa: E402
 from typing import TYPE_CHECKING, Any  # noqa: E402
 
-from egopose.config import compose_config, from_mapping  # noqa: E402
+from egopose.config import check_arguments, compose_config, from_mapping  # noqa: E402
 from egopose.errors import InputError  # noqa: E402
 
 if TYPE_CHECKING:
@@ -167,6 +167,7 @@ def main() -> None:
     # An unknown option is told by the writers, which know their own.
     overrides = [f"+{word}" if word.startswith("options.") else word for word in overrides]
     try:
+        check_arguments(words)
         if len(sources) != 1:
             raise InputError("export", "source", f"takes one motion or evaluation, not {len(sources)}: {sources}")
         for path in run_export(Path(sources[0]), files, compose_config("export", overrides)):

@@ -15,7 +15,7 @@ from collections.abc import Mapping, Sequence  # noqa: E402
 from pathlib import Path  # noqa: E402
 from typing import TYPE_CHECKING, Any  # noqa: E402
 
-from egopose.config import compose_config, from_mapping  # noqa: E402
+from egopose.config import check_arguments, compose_config, from_mapping  # noqa: E402
 from egopose.errors import InputError  # noqa: E402
 
 if TYPE_CHECKING:
@@ -71,6 +71,7 @@ def main() -> None:
         raise SystemExit(0 if words else 2)
     folders = [word for word in words if "=" not in word]
     try:
+        check_arguments(words)
         if len(folders) != 1:
             raise InputError("report", "folder", f"takes one folder, not {len(folders)}: {folders}")
         print(run_report(Path(folders[0]), [word for word in words if "=" in word]))

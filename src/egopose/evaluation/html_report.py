@@ -193,7 +193,7 @@ def _over_time(takes: Sequence[TakeMotions], settings: ReportSettings) -> str:
     for take, (ours, theirs) in list(zip(takes, errors, strict=True))[: settings.takes]:
         seconds = np.arange(len(ours)) / fps
         resets = seconds[take.columns["reset"] > 0] if "reset" in take.columns else seconds[:0]
-        said = f" (dashed: {len(resets)} resets)" if len(resets) else ""
+        said = f" (dashed: {len(resets)} reset{'s' if len(resets) > 1 else ''})" if len(resets) else ""
         parts.append(f"<h3>{escape(take.name)}{said}</h3>")
         lines = [Line("ours", seconds, ours), Line("PoseReg", seconds, theirs)]
         parts.append(charts.line_chart(lines, "s", label, resets))
