@@ -8,8 +8,10 @@ prepare_runtime()
 
 import contextlib  # noqa: E402
 import gc  # noqa: E402
+import signal  # noqa: E402
 import sys  # noqa: E402
-from collections.abc import Mapping  # noqa: E402
+import threading  # noqa: E402
+from collections.abc import Callable, Mapping  # noqa: E402
 from dataclasses import dataclass, replace  # noqa: E402
 from pathlib import Path  # noqa: E402
 from typing import TYPE_CHECKING, Any  # noqa: E402
@@ -24,8 +26,10 @@ if TYPE_CHECKING:
     from torchrl.envs import TransformedEnv
 
     from egopose.humanoid.model import HumanoidModel
-    from egopose.inference.stream.body import LivePose
+    from egopose.inference.causal import CausalRegression
+    from egopose.inference.stream.body import LiveBody, LivePose
     from egopose.inference.stream.loop import LiveLoop, PoseSink, StatusSink
+    from egopose.inference.stream.sight import Sight
     from egopose.inference.stream.sources import SourceSettings
     from egopose.material import Material
     from egopose.models.regressor import StateRegressor
@@ -114,12 +118,32 @@ def build_loop(values: Mapping[str, Any], trained: Trained, source: SourceSettin
     settings = from_mapping(LoopSettings, limits, _CONFIG)
     flow = FlowConfig(**dict(trained.made_with["vision"]["flow"]))
     latency = LatencyTable(STAGES, values["latency_frames"])
-    sight = Sight(trained.regressor, flow)
-    regression = causal_regression(
-        trained.humanoid, trained.regressor, trained.made_with, trained.config["task"], values["lookahead"]
-    )
-    body = LiveBody(trained.env, trained.actor, trained.critic, failsafe, latency.lap)
-    return LiveLoop(source, sight, regression, body, latency, 1.0 / trained.humanoid.control_dt, settings)
+
+    def parts(lap: Callable[[str], None]) -> tuple[Sight, CausalRegression, LiveBody]:
+        """As at the start: nothing seen yet."""
+        task, lookahead = trained.config["task"], values["lookahead"]
+        return (
+            Sight(trained.regressor, flow),
+            causal_regression(trained.humanoid, trained.regressor, trained.made_with, task, lookahead),
+            LiveBody(trained.env, trained.actor, trained.critic, failsafe, lap),
+        )
+
+    warm_up(*parts(lambda stage: None))
+    return LiveLoop(source, *parts(latency.lap), latency, 1.0 / trained.humanoid.control_dt, settings)
+
+
+def warm_up(sight: Sight, regression: CausalRegression, body: LiveBody) -> None:
+    """Let all parts do their work on a still picture: the first time takes a hundred times as long."""
+    import numpy as np
+
+    still = np.zeros((64, 64, 3), np.uint8)
+    poses = frame = 0
+    while poses < 3:
+        seen = regression.push(frame, sight.features(sight.flow(still)))
+        frame += 1
+        if seen is not None:
+            body.advance(seen)
+            poses += 1
 
 
 def source_settings(values: Mapping[str, Any], config: Mapping[str, Any] | None = None) -> SourceSettings:
@@ -158,8 +182,8 @@ def take_video(config: Mapping[str, Any], name: str) -> tuple[Path, float]:
     return store.video(number), store.takes[number].sync_offset
 
 
-def stream(values: Mapping[str, Any]) -> dict[str, Any]:
-    """The whole way of ``conf/stream.yaml``, resolved, until the source ends or Ctrl-C.
+def stream(values: Mapping[str, Any], stop: threading.Event | None = None) -> dict[str, Any]:
+    """The whole way of ``conf/stream.yaml``, resolved, until the source ends or ``stop`` is set.
 
     Returns:
         The last status, see :meth:`LiveLoop.status`.
@@ -178,9 +202,7 @@ def stream(values: Mapping[str, Any]) -> dict[str, Any]:
     with contextlib.ExitStack() as stack:
         on_pose, on_status = _outputs(values, server, trained, source, fps, stack)
         settle_memory()
-        with contextlib.suppress(KeyboardInterrupt):
-            loop.run(on_pose, on_status)
-        last = loop.status()
+        last = loop.run(on_pose, on_status, stop)
         on_status({**last, "end": True})
     return last
 
@@ -240,8 +262,12 @@ def print_report(status: Mapping[str, Any]) -> None:
 @command("stream")
 def main(config: DictConfig) -> None:
     """Hydra's entry."""
+    stop = threading.Event()
+    # Not an exception out of nowhere: what was seen so far is to be written whole.
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: stop.set())
     try:
-        print_report(stream(resolved(config)))
+        print_report(stream(resolved(config), stop))
     except InputError as error:
         print(f"error: {error}", file=sys.stderr)
         raise SystemExit(2) from None
