@@ -73,7 +73,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def settings(video: Path, checkpoint: Path, **changed: Any) -> dict[str, Any]:
     failsafe = {"mode": "value", "kappa": 0.6, "fallen_height": 0.3}
     values = {"which": "latest", "out": None, "offset": 0.0, "size": 64, "failsafe": failsafe}
-    values |= {"causal": False, "lookahead": 10}
+    values |= {"causal": False, "lookahead": 10, "camera": {}}
     return {"video": str(video), "checkpoint": str(checkpoint), **values, **changed}
 
 

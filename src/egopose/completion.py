@@ -86,13 +86,23 @@ def _settings(folder: Path, verb: str, groups: dict[str, str | None]) -> Iterato
     """Every ``key=`` of the verb's own file and of its groups' choices."""
     yield from _keys(_load(folder / f"{verb}.yaml"), "")
     for group, choice in groups.items():
-        path = folder / group / f"{choice}.yaml"
-        if path.is_file():
-            values = _load(path)
-            yield from _keys(values, f"{group}.")
-            for base in values.get("defaults", []):
-                if isinstance(base, str) and base != "_self_":
-                    yield from _keys(_load(folder / group / f"{base}.yaml"), f"{group}.")
+        yield from _choice(folder, group, f"{choice}", f"{group}.")
+
+
+def _choice(folder: Path, group: str, choice: str, prefix: str) -> Iterator[str]:
+    """Of one file of a group, and of those it builds on."""
+    path = folder / group / f"{choice}.yaml"
+    if not path.is_file():
+        return
+    values = _load(path)
+    yield from _keys(values, prefix)
+    for base in values.get("defaults", []):
+        if isinstance(base, dict):  # {/group@package: choice}
+            for name, chosen in base.items():
+                other, _, package = name.lstrip("/").partition("@")
+                yield from _choice(folder, other, str(chosen), f"{prefix}{package}.")
+        elif base != "_self_":
+            yield from _choice(folder, group, str(base), prefix)
 
 
 def _keys(values: dict[str, Any], prefix: str) -> Iterator[str]:

@@ -186,6 +186,7 @@ def run_estimate(config: Mapping[str, Any], agent: Agent, pose_motion: Motion, v
     from egopose.evaluation.tables import write_columns_csv
     from egopose.inference.estimator import estimate_takes
     from egopose.inference.failsafe import FailSafe, FailSafeSettings
+    from egopose.vision.lens import Camera
 
     guard = FailSafe(1, from_mapping(FailSafeSettings, config["failsafe"], "conf/estimate.yaml: failsafe"))
     torch.set_num_threads(1)
@@ -199,7 +200,8 @@ def run_estimate(config: Mapping[str, Any], agent: Agent, pose_motion: Motion, v
     write_motion_files(out, "estimate", motion)
     write_columns_csv(out / "frames.csv", estimate.columns())
     motions = {"estimate": motion, "PoseReg": pose_motion}
-    seen = TakeVideo(video, float(config["offset"]), rendered=False)
+    camera = Camera.from_mapping(config["camera"], "camera")
+    seen = TakeVideo(video, float(config["offset"]), rendered=False, taken_at=camera.fps)
     write_side_by_side(out / "side_by_side.mp4", humanoid, motions, seen, 0, int(config["size"]))
     print(f"{len(motion)} frames, {estimate.n_resets} resets by the fail-safe; written to {out}", flush=True)
     return out
@@ -239,6 +241,7 @@ def estimate_video(values: Mapping[str, Any]) -> Path:
     from egopose.regression import load_regressor
     from egopose.training.checkpoint import find_checkpoint, read_json
     from egopose.vision.features import extract_flow
+    from egopose.vision.lens import Camera
 
     video = Path(str(values["video"]))
     out = video.with_name(f"{video.stem}_estimate") if values["out"] is None else Path(str(values["out"]))
@@ -248,7 +251,9 @@ def estimate_video(values: Mapping[str, Any]) -> Path:
     humanoid = humanoid_of(run)
     regressor, made_with = load_regressor(run_folder(checkpoint) / "regressor")
     lookahead = allowed_lookahead(values)
-    flow = extract_flow(video, made_with["vision"]["flow"], 1.0 / humanoid.control_dt, float(values["offset"]))
+    camera = Camera.from_mapping(values["camera"], "camera")
+    rate, offset = 1.0 / humanoid.control_dt, float(values["offset"])
+    flow = extract_flow(video, made_with["vision"]["flow"], rate, offset, camera=camera)
     overrides = None
     if lookahead is None:
         seen = seen_in(humanoid, regressor, flow, made_with)

@@ -347,7 +347,9 @@ def take_videos(config: Mapping[str, Any]) -> tuple[list[str], list[TakeVideo | 
     """
     store = TakeStore.open(store_folder(config))
     videos = [
-        TakeVideo(store.video(i), take.sync_offset, take.rendered) if store.video(i).is_file() else None
+        TakeVideo(store.video(i), take.sync_offset, take.rendered, (take.camera or {}).get("fps"))
+        if store.video(i).is_file()
+        else None
         for i, take in enumerate(store.takes)
     ]
     return [take.name for take in store.takes], videos

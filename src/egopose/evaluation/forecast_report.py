@@ -175,7 +175,7 @@ def write_futures_video(
 def _last_seen(window: ForecastWindow, video: TakeVideo | None, fps: float, size: int) -> Frame | None:
     if video is None:
         return None
-    (frame,) = iter_frames(video.path, fps, video.sync_offset + window.now / fps, 1)
+    (frame,) = iter_frames(video.path, fps, video.sync_offset + window.now / fps, 1, video.taken_at)
     return label_frame(middle_square(frame, size), f"last seen{' (rendered)' if video.rendered else ''}")
 
 

@@ -24,11 +24,16 @@ HEADLINE = ("E_pose", "E_vel", "A_accl", "mpjpe_root_aligned", "root_drift", "fo
 
 @dataclass(frozen=True)
 class TakeVideo:
-    """The wearer's video of a take: the motion's time t is the video's ``t + sync_offset`` seconds."""
+    """The wearer's video of a take: the motion's time t is the video's ``t + sync_offset`` seconds.
+
+    ``taken_at`` is the rate of filming where the file's stamps are not of it, see
+    :func:`egopose.vision.video.read_frames`.
+    """
 
     path: Path
     sync_offset: float
     rendered: bool
+    taken_at: float | None = None
 
     @property
     def label(self) -> str:
@@ -104,7 +109,7 @@ def write_side_by_side(
         RuntimeError: no OpenGL here.
     """
     first = next(iter(motions.values()))
-    seen = iter_frames(video.path, first.fps, video.sync_offset + start / first.fps, len(first))
+    seen = iter_frames(video.path, first.fps, video.sync_offset + start / first.fps, len(first), video.taken_at)
     bodies = {label: motion.qpos for label, motion in motions.items()}
     write_video(path, side_by_side(humanoid.mj_model, bodies, seen, video.label, size), first.fps)
 
