@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from omegaconf import OmegaConf
+import yaml
 
 from egopose.config import config_dir
 
@@ -72,7 +72,7 @@ def candidates(line: str, verbs: list[str]) -> list[str]:
 
 def _load(path: Path) -> dict[str, Any]:
     """One of the package's own files, interpolations as they stand."""
-    values = OmegaConf.to_container(OmegaConf.load(path), resolve=False)
+    values = yaml.safe_load(path.read_text())
     return {str(key): value for key, value in values.items()} if isinstance(values, dict) else {}
 
 
