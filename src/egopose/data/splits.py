@@ -60,7 +60,6 @@ def split_takes(
         pieces = [(max(start, a), min(stop, b)) for a, b in runs]
         out += [Fragment(index, a, b) for a, b in pieces if b - a >= shortest]
     if not out:
-        raise InputError(
-            "data.split", part, f"leaves no fragment of {shortest} frames; see data.split in the configuration"
-        )
+        cause = f"leaves no fragment of {shortest} frames: give longer takes, or a smaller data.split.shortest"
+        raise InputError("data.split", part, cause)
     return out
