@@ -113,6 +113,7 @@ def test_latencies_are_the_percentiles_of_the_last_frames() -> None:
     assert found["a"]["p50_ms"] <= found["a"]["p95_ms"] <= found["a"]["p99_ms"]
     assert found["compute"]["p50_ms"] >= found["a"]["p50_ms"]
     assert table.frames == 20
+    assert table.percentiles_ms(1)["delay"]["p50_ms"] == table.percentiles_ms(1)["delay"]["p99_ms"]
     assert table._rows.shape == (8, 4)
 
 

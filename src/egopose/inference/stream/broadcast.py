@@ -114,11 +114,6 @@ class Broadcast:
             raise InputError(_FIELD, "port", cause)
 
     @property
-    def listening(self) -> bool:
-        """Whether there is any client."""
-        return bool(self._clients)
-
-    @property
     def kinds(self) -> set[bool]:
         """Of the clients: True where one takes bytes, False where one takes text."""
         with self._lock:

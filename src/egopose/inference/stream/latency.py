@@ -48,11 +48,15 @@ class LatencyTable:
         self._rows[self.frames % len(self._rows)] = self._row
         self.frames += 1
 
-    def percentiles_ms(self) -> dict[str, dict[str, float]]:
-        """``{stage: {"p50_ms": ..., "p95_ms": ..., "p99_ms": ...}}`` of the frames remembered; empty without any."""
-        rows = self._rows[: min(self.frames, len(self._rows))]
-        if not len(rows):
+    def percentiles_ms(self, last: int | None = None) -> dict[str, dict[str, float]]:
+        """``{stage: {"p50_ms": ..., "p95_ms": ..., "p99_ms": ...}}`` of the ``last`` frames; empty without any.
+
+        None for all that are remembered: of an hour that takes as long as several frames.
+        """
+        count = min(self.frames, len(self._rows) if last is None else min(last, len(self._rows)))
+        if not count:
             return {}
+        rows = self._rows[np.arange(self.frames - count, self.frames) % len(self._rows)]
         table = 1e3 * np.percentile(rows, PERCENTILES, axis=0)
         names = [f"p{p}_ms" for p in PERCENTILES]
         return {

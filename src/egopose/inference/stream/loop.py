@@ -31,6 +31,7 @@ PoseSink = Callable[[LivePose, float], None]
 StatusSink = Callable[[dict[str, Any]], None]
 
 _STATUS_EVERY = 1.0  # s
+_STATUS_FRAMES = 300  # whose latencies a status tells
 
 
 @dataclass(frozen=True)
@@ -128,16 +129,17 @@ class LiveLoop:
             reader.join(timeout=2.0)
         return self.status()
 
-    def status(self) -> dict[str, Any]:
+    def status(self, last: int | None = None) -> dict[str, Any]:
         """``seconds`` since the start, the counts, ``dropped`` (late pictures), ``fps`` (pictures used a second),
-        ``stages`` (see :meth:`LatencyTable.percentiles_ms`) and memory (see :meth:`MemoryTrace.report`)."""
+        ``stages`` (of the ``last`` frames, see :meth:`LatencyTable.percentiles_ms`) and memory (see
+        :meth:`MemoryTrace.report`)."""
         seconds = time.perf_counter() - self._began
         return {
             "seconds": seconds,
             **vars(self.counts),
             "dropped": self._newest.dropped,
             "fps": self.counts.used / max(seconds, 1e-9),
-            "stages": self.latency.percentiles_ms(),
+            "stages": self.latency.percentiles_ms(last),
             **self.memory.report(),
         }
 
@@ -185,4 +187,4 @@ class LiveLoop:
         if now - self._told >= _STATUS_EVERY:
             self._told = now
             self.memory.sample(now - self._began)
-            on_status(self.status())
+            on_status(self.status(_STATUS_FRAMES))
