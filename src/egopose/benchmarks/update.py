@@ -61,7 +61,7 @@ def run(overrides: Sequence[str], rounds: int) -> dict[str, Any]:
         iterate()
         measured = [iterate() for _ in range(rounds)]
         collect, advantages, update, rows = (statistics.median(column) for column in zip(*measured, strict=True))
-        parts = _taken_apart(iterate, env, ppo)
+        parts = _taken_apart(iterate, env, ppo, collector)
     finally:
         collector.shutdown()
     per_epoch = 1 if ppo.settings.minibatch_size is None else max(1, int(rows) // ppo.settings.minibatch_size)
@@ -79,7 +79,9 @@ def run(overrides: Sequence[str], rounds: int) -> dict[str, Any]:
     }
 
 
-def _taken_apart(iterate: Callable[[], tuple[float, float, float, int]], env: Any, ppo: Any) -> dict[str, float]:
+def _taken_apart(
+    iterate: Callable[[], tuple[float, float, float, int]], env: Any, ppo: Any, collector: Any
+) -> dict[str, float]:
     """Seconds of one iteration by part, each without the parts inside it.
 
     ``other_environment`` is what is left of a step, ``collector`` TorchRL's own and the assembling of the batch,
@@ -108,11 +110,12 @@ def _taken_apart(iterate: Callable[[], tuple[float, float, float, int]], env: An
         object.__setattr__(owner, name, outer)
 
     base = env.base_env
-    timed(ppo.actor, "forward", "policy")
+    timed(collector.policy, "forward", "policy")
+    timed(collector, "postproc", "policy")  # the actions' probabilities
+    timed(base, "rewards_due", "reward")
     timed(env, "step_and_maybe_reset", "other_environment")
     timed(base.physics, "step", "physics_and_kinematics")
     timed(base.problem, "observation", "observation")
-    timed(base.problem, "rewards", "reward")
     timed(env.transform, "_step", "transforms")
     timed(env.transform, "_reset", "resets")
     timed(base, "begin", "resets")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -11,9 +11,33 @@ from torch import Tensor
 from torchrl.data import Binary, Composite, Unbounded
 from torchrl.envs import EnvBase
 
+from egopose.envs.mdp.observations import BodyState, BodyView
 from egopose.envs.problem import ImitationProblem
 from egopose.envs.starts import Starts
 from egopose.humanoid.physics import BatchedPhysics
+
+_STEPS_REWARDED_AT_ONCE = 8  # of all worlds: measured, at 64 worlds; twice or half as many are as quick
+
+
+class _Unrewarded(NamedTuple):
+    """What the reward of a step reads: body state, ``[N]`` global frame, steps into the episode, diverged."""
+
+    state: dict[str, Tensor]
+    frame: Tensor
+    step: Tensor
+    diverged: Tensor
+
+
+def _joined(steps: list[_Unrewarded]) -> _Unrewarded:
+    """Steps one after the other, as if of many worlds."""
+    state = {key: torch.cat([step.state[key] for step in steps]) for key in steps[0].state}
+    frame, step, diverged = (torch.cat(column) for column in list(zip(*steps, strict=True))[1:])
+    return _Unrewarded(state, frame, step, diverged)
+
+
+def _no_flags(size: torch.Size) -> dict[str, Tensor]:
+    names = ("fallen", "diverged", "done", "terminated", "truncated")
+    return dict(zip(names, torch.zeros(len(names), *size, 1, dtype=torch.bool).unbind(), strict=True))
 
 
 class EgoPoseEnv(EnvBase):
@@ -37,6 +61,8 @@ class EgoPoseEnv(EnvBase):
         threads: of the physics.
         seed: of the starts.
         dump_dir: where diverged worlds leave their last states.
+
+    A collector need not know a reward to act on: after :meth:`defer_rewards` it asks for those of a batch at once.
 
     The simulation's state is :meth:`state_dict`; note that TorchRL's ``TransformedEnv.state_dict`` holds the
     transforms only: take the base environment's beside it.
@@ -67,9 +93,13 @@ class EgoPoseEnv(EnvBase):
         counter = torch.zeros(n_worlds, dtype=torch.int64)
         self._take, self._start, self._stop, self._frame = (counter.clone() for _ in range(4))
         self.placed = torch.zeros(n_worlds, humanoid.mj_model.nu, dtype=torch.float64)
-        self._make_specs(n_worlds)
+        self._unrewarded: list[_Unrewarded] | None = None
+        self._unknown_reward = torch.full((n_worlds, 1), torch.nan)
+        self._no_flags = _no_flags(self.batch_size)
+        self._make_specs()
 
-    def _make_specs(self, n: int) -> None:
+    def _make_specs(self) -> None:
+        n = self.batch_size[0]
         model = self.problem.humanoid.mj_model
         whole, flag = Unbounded((n, 1), dtype=torch.int64), Binary(1, (n, 1), dtype=torch.bool)
         self.observation_spec = Composite(
@@ -78,7 +108,7 @@ class EgoPoseEnv(EnvBase):
             episode_start=whole.clone(),
             episode_stop=whole.clone(),
             episode_step=whole.clone(),
-            reward_terms=Composite({k: Unbounded((n, 1)) for k in self.problem.reward.names}, shape=(n,)),
+            **self._terms_spec(),
             fallen=flag.clone(),
             diverged=flag.clone(),
             shape=(n,),
@@ -89,6 +119,44 @@ class EgoPoseEnv(EnvBase):
             {k: flag.clone() for k in ("done", "terminated", "truncated")},
             shape=(n,),
         )
+
+    def _terms_spec(self) -> dict[str, Composite]:
+        if self._unrewarded is not None:
+            return {}
+        n = self.batch_size[0]
+        return {"reward_terms": Composite({k: Unbounded((n, 1)) for k in self.problem.reward.names}, shape=(n,))}
+
+    def defer_rewards(self) -> None:
+        """From now on a step's ``reward`` is NaN and it has no ``reward_terms``: :meth:`rewards_due` gives both.
+
+        What the reward reads of each step is kept until then.
+        """
+        self._unrewarded = []
+        self._make_specs()
+
+    def rewards_due(self) -> dict[str, Tensor]:
+        """``reward`` and its terms by name, ``[N, T, 1]`` float32 each, of the T steps since the last call.
+
+        What each step would have given, worked out for many steps at once: a fourth of the cost.
+
+        Raises:
+            RuntimeError: rewards are not deferred, or no step was taken.
+        """
+        if not self._unrewarded:
+            raise RuntimeError("no step waits for its reward")
+        steps, self._unrewarded = self._unrewarded, []
+        # Some at a time: what is worked out between fits the core's cache.
+        parts = [
+            self._earned(*_joined(steps[i : i + _STEPS_REWARDED_AT_ONCE]))
+            for i in range(0, len(steps), _STEPS_REWARDED_AT_ONCE)
+        ]
+        earned = torch.cat(parts).unflatten(0, (len(steps), -1)).permute(2, 1, 0).contiguous()
+        return dict(zip(("reward", *self.problem.reward.names), earned.unsqueeze(-1).unbind(), strict=True))
+
+    def _earned(self, state: BodyState | BodyView, frame: Tensor, step: Tensor, diverged: Tensor) -> Tensor:
+        """Reward and terms ``[n, 1 + K]`` float32 at global frames ``[n]``; a diverged world earns nothing."""
+        reward, terms = self.problem.rewards(state, frame, step)
+        return (torch.stack([reward, *terms.values()], dim=-1) * ~diverged[:, None]).float()
 
     @property
     def frame(self) -> Tensor:
@@ -124,9 +192,15 @@ class EgoPoseEnv(EnvBase):
 
     def _begin(self, worlds: Tensor, *state: Tensor) -> None:
         episodes = self.starts(worlds, self._generator)
-        self._take[worlds], self._start[worlds], self._stop[worlds] = episodes.take, episodes.start, episodes.stop
-        self._frame[worlds] = episodes.start
-        self.place(worlds, *(state or self.problem.first_state(episodes.start)))
+        # New counters, not new values in the old ones: those are in the observations given out.
+        self._take = self._take.index_copy(0, worlds, episodes.take)
+        self._start = self._start.index_copy(0, worlds, episodes.start)
+        self._stop = self._stop.index_copy(0, worlds, episodes.stop)
+        self._frame = self._frame.index_copy(0, worlds, episodes.start)
+        if state:
+            self.place(worlds, *state)
+        else:
+            self._put(worlds, *self.problem.first_state(episodes.start))
 
     def place(self, worlds: Tensor, qpos: Tensor, qvel: Tensor) -> None:
         """Put ``worlds [n]`` at ``qpos [n, 59]`` and ``qvel [n, 58]`` without touching their time or episode.
@@ -136,65 +210,77 @@ class EgoPoseEnv(EnvBase):
         """
         if not (torch.isfinite(qpos).all() and torch.isfinite(qvel).all()):
             raise ValueError("a world cannot be placed at a state that is not finite")
+        self._put(worlds, qpos, qvel)
+
+    def _put(self, worlds: Tensor, qpos: Tensor, qvel: Tensor) -> None:
         self.physics.set_state(worlds.numpy(), qpos.double().numpy(), qvel.double().numpy())
-        self.placed[worlds] = qpos[:, 7:].double()
+        if self.problem.action.reference == "start":
+            self.placed[worlds] = qpos[:, 7:].double()
 
     def observe(self, worlds: Tensor | None = None) -> TensorDict:
         """The present observation of ``worlds [n]`` (default all), as a reset would return it (after :meth:`place`)."""
-        # The state z needs no kinematics, and concatenating makes a copy of it. All worlds at once even for a few: how
-        # matrix products round depends on their shape.
-        z = self.problem.observation(
-            {"qpos": torch.from_numpy(self.physics.qpos), "qvel": torch.from_numpy(self.physics.qvel)}
-        ).float()
-        rows = slice(None) if worlds is None else worlds
-        z = z[rows]
+        # The state z needs no kinematics, and concatenating makes a copy of it.
+        rows = slice(None) if worlds is None else worlds.numpy()
+        qpos, qvel = self.physics.qpos[rows], self.physics.qvel[rows]
+        z = self.problem.observation({"qpos": torch.from_numpy(qpos), "qvel": torch.from_numpy(qvel)}).float()
         size = z.shape[:1]
-        terms = torch.zeros(*size, len(self.problem.reward.names)).split(1, dim=-1)
-        flags = ("fallen", "diverged", "done", "terminated", "truncated")
         return TensorDict(
             {
-                **self._clock(rows),
+                **self._clock(worlds),
                 "humanoid_state": z,
-                "reward_terms": TensorDict(dict(zip(self.problem.reward.names, terms, strict=True)), batch_size=size),
-                **{k: torch.zeros(*size, 1, dtype=torch.bool) for k in flags},
+                **self._terms(torch.zeros(*size, len(self.problem.reward.names))),
+                **_no_flags(size),
             },
             batch_size=size,
         )
 
-    def _clock(self, rows: Tensor | slice = slice(None)) -> dict[str, Tensor]:
-        frame, start, stop = self._frame[rows, None], self._start[rows, None], self._stop[rows, None]
-        # Copies: a reset writes into the counters.
-        return {
-            "frame": frame.clone(),
-            "episode_start": start.clone(),
-            "episode_stop": stop.clone(),
-            "episode_step": frame - start,
-        }
+    def ongoing(self, fallen: Tensor) -> dict[str, Tensor]:
+        """Counters and flags of all worlds where those that were done have begun anew; ``fallen`` ``[N, 1]`` before."""
+        return {**self._clock(), **self._no_flags, "fallen": fallen}
+
+    def _terms(self, columns: Tensor) -> dict[str, TensorDict]:
+        """``reward_terms`` of ``[n, K]``, unless they are deferred."""
+        if self._unrewarded is not None:
+            return {}
+        terms = dict(zip(self.problem.reward.names, columns.split(1, dim=-1), strict=True))
+        return {"reward_terms": TensorDict(terms, batch_size=columns.shape[:1])}
+
+    def _clock(self, worlds: Tensor | None = None) -> dict[str, Tensor]:
+        counters = [self._frame, self._start, self._stop]
+        if worlds is not None:
+            counters = [counter.index_select(0, worlds) for counter in counters]
+        frame, start, stop = (counter.unsqueeze(-1) for counter in counters)
+        return {"frame": frame, "episode_start": start, "episode_stop": stop, "episode_step": frame - start}
 
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
         # A world past its fragment's end (evaluation steps on until the last world is done) stays on its last frame.
         self._frame = torch.minimum(self._frame + 1, self._stop - 1)
         target = self.problem.target(tensordict["action"].detach(), self._frame, self.placed)
         diverged = torch.from_numpy(self.physics.step(target.numpy()).copy())
-        state = self.problem.view({k: torch.from_numpy(v) for k, v in self.physics.body_state().items()})
-        reward, terms = self.problem.rewards(state, self._frame, self._frame - self._start)
+        body = {k: torch.from_numpy(v) for k, v in self.physics.body_state().items()}
+        state = self.problem.view(body)
         fallen = self.problem.fallen(state, self._take)
         terminated = diverged | fallen if self.problem.termination.enabled else diverged
         truncated = (self._frame >= self._stop - 1) & ~terminated
-        # One tensor for all: a diverged world earns nothing.
-        earned = torch.stack([reward, *terms.values()], dim=-1) * ~diverged[:, None]
-        columns = earned.float().split(1, dim=-1)
+        clock = self._clock()
+        steps = clock["episode_step"].squeeze(-1)
+        if self._unrewarded is None:
+            earned = self._earned(state, self._frame, steps, diverged)
+            reward, terms = earned[:, :1], self._terms(earned[:, 1:])
+        else:
+            self._unrewarded.append(_Unrewarded(body, self._frame, steps, diverged))
+            reward, terms = self._unknown_reward, {}
         return TensorDict(
             {
-                **self._clock(),
+                **clock,
                 "humanoid_state": self.problem.observation(state).float(),
-                "reward": columns[0],
-                "reward_terms": TensorDict(dict(zip(terms, columns[1:], strict=True)), batch_size=self.batch_size),
-                "fallen": fallen[:, None],
-                "diverged": diverged[:, None],
-                "terminated": terminated[:, None],
-                "truncated": truncated[:, None],
-                "done": (terminated | truncated)[:, None],
+                "reward": reward,
+                **terms,
+                "fallen": fallen.unsqueeze(-1),
+                "diverged": diverged.unsqueeze(-1),
+                "terminated": terminated.unsqueeze(-1),
+                "truncated": truncated.unsqueeze(-1),
+                "done": (terminated | truncated).unsqueeze(-1),
             },
             batch_size=self.batch_size,
         )

@@ -171,7 +171,7 @@ class ImitationProblem:
 
     def first_state(self, frame: Tensor) -> tuple[Tensor, Tensor]:
         """The reference's ``qpos [n, nq]`` and ``qvel [n, nv]`` at global frames ``[n]``, where episodes begin."""
-        return self._qpos[frame], self._qvel[frame]
+        return self._qpos.index_select(0, frame), self._qvel.index_select(0, frame)
 
     def view(self, state: BodyState | BodyView) -> BodyView:
         """``state`` and what follows from it; the functions below take either, and share the work given a view."""
@@ -192,7 +192,7 @@ class ImitationProblem:
                 raise ValueError("action.reference=start needs the joint angles the bodies were placed with")
             base = placed
         else:
-            base = self._rest if self._table is None else self._table[frame]
+            base = self._rest if self._table is None else self._table.index_select(0, frame)
         return torch.clamp(base + self.action.scale * action.to(torch.float64), self._range[0], self._range[1])
 
     def observation(self, state: BodyState | BodyView) -> Tensor:
@@ -201,11 +201,11 @@ class ImitationProblem:
 
     def rewards(self, state: BodyState | BodyView, frame: Tensor, step: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
         """Reward ``[N]`` and its terms for states at global frames ``[N]``, ``step [N]`` steps into the episode."""
-        reference = SimpleNamespace(**{name: table[frame] for name, table in self._rewarded.items()})
+        reference = SimpleNamespace(**{name: table.index_select(0, frame) for name, table in self._rewarded.items()})
         return self.reward(self.view(state), reference, step)
 
     def fallen(self, state: BodyState | BodyView, take: Tensor) -> Tensor:
         """``[N]``: the head is too low for ``take [N]``, whether or not that ends the episode."""
-        lowest = self.takes.lowest_head_height[take]
+        lowest = self.takes.lowest_head_height.index_select(0, take)
         head = self.view(state).xpos[:, self.humanoid.head, 2]
         return terminations.fallen(head, lowest, self.termination.head_drop)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import torch
 from tensordict import TensorDictBase
 from torchrl.envs import Compose, TransformedEnv
 from torchrl.envs.transforms import Transform
@@ -26,10 +25,16 @@ class TransformedEgoPoseEnv(TransformedEnv):
     def __init__(self, env: EgoPoseEnv, *transforms: Transform) -> None:
         super().__init__(env, Compose(*transforms))
 
+    def defer_rewards(self) -> None:
+        """See :meth:`EgoPoseEnv.defer_rewards`."""
+        self.base_env.defer_rewards()
+        self.empty_cache()
+
     def step_and_maybe_reset(self, tensordict: TensorDictBase) -> tuple[TensorDictBase, TensorDictBase]:
         """See ``EnvBase.step_and_maybe_reset``: the transition, and what the next step starts from."""
         written = tensordict.get("next", None)
-        after = self.transform._step(tensordict, self.base_env._step(tensordict))
+        base = self.base_env
+        after = self.transform._step(tensordict, base._step(tensordict))
         if written is not None:
             after.update(written.exclude(*after.keys(include_nested=True)))
         tensordict.set("next", after)
@@ -38,10 +43,13 @@ class TransformedEgoPoseEnv(TransformedEnv):
         del follows["reward"]
         if bool(done.any()):
             worlds = done.squeeze(-1).nonzero().squeeze(-1)
-            fresh = self.base_env.begin(worlds)
+            fresh = base.begin(worlds)
+            known = base.ongoing(after["fallen"] & ~done)
             fresh = self.transform._reset(fresh.empty(), fresh)
             for key, value in fresh.items(include_nested=True, leaves_only=True):
                 # A hidden state is missing where the actions came from elsewhere.
-                if (before := after.get(key, None)) is not None:
-                    follows.set(key, torch.index_copy(before, 0, worlds, value))
+                if key in known:
+                    follows.set(key, known[key])
+                elif (before := after.get(key, None)) is not None:
+                    follows.set(key, before.index_copy(0, worlds, value))
         return tensordict, follows

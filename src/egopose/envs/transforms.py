@@ -28,8 +28,11 @@ class VisualContext(Transform):
     def _apply_transform(self, obs: Tensor) -> Tensor:
         return self.table[obs.squeeze(-1)]
 
+    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
+        return next_tensordict.set(self.out_keys[0], self._apply_transform(next_tensordict[self.in_keys[0]]))
+
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
-        return self._call(tensordict_reset)
+        return self._step(tensordict, tensordict_reset)
 
     def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
         assert isinstance(observation_spec, Composite)
@@ -66,8 +69,8 @@ class TrackingError(Transform):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Writes :attr:`out_keys` from the raw ``humanoid_state`` and ``frame``."""
         frame = tensordict["frame"].squeeze(-1)
-        now = self.table[frame]
-        ahead = self.table[self.following[frame]]
+        now = self.table.index_select(0, frame)
+        ahead = self.table.index_select(0, self.following.index_select(0, frame))
         error = torch.stack([tensordict["humanoid_state"], ahead], dim=-2).sub_(now.unsqueeze(-2)).div_(self.scale)
         return tensordict.set(self.out_keys[0], error.clamp_(-self.clip, self.clip).flatten(-2))
 
@@ -153,15 +156,15 @@ class StateNormalizer(Transform):
         before = int(self.count)
         total = before + n
         delta = mean - self.mean
-        self.sum_of_squares += (values - mean).square().sum(0) + delta.square() * (before * n / total)
-        self.mean += delta * (n / total)
+        self.sum_of_squares.add_((values - mean).square_().sum(0)).addcmul_(delta, delta, value=before * n / total)
+        self.mean.add_(delta, alpha=n / total)
         self.count += n
 
     def normalize(self, values: Tensor) -> Tensor:
         """``values [..., D]`` by the present statistics, in their own dtype."""
         # The floor keeps a constant feature's rounding noise from being blown up.
-        scaled = (values.to(torch.float64) - self.mean) / (self.std + 1e-8)
-        return scaled.clamp(-self.clip, self.clip).to(values.dtype)
+        scaled = (values.to(torch.float64) - self.mean).div_(self.std.add_(1e-8))
+        return scaled.clamp_(-self.clip, self.clip).to(values.dtype)
 
     def _apply_transform(self, obs: Tensor) -> Tensor:
         return self.normalize(obs)

@@ -12,7 +12,9 @@ from torchrl.collectors import Collector
 from torchrl.envs import EnvBase
 
 from egopose.config import from_mapping
+from egopose.envs.transformed import TransformedEgoPoseEnv
 from egopose.errors import InputError
+from egopose.training.deferral import Completion, GaussianSampler, draws_gaussian
 from egopose.training.workers import Workers, base_env, read_simulation, write_simulation
 
 __all__ = [
@@ -72,18 +74,23 @@ def build_collector(
 ) -> Collector | Workers:
     """A collector that never ends; one iteration gives ``steps_per_iteration`` control steps over all worlds.
 
-    ``make_env`` gets the worker's number, to seed by.
+    ``make_env`` gets the worker's number, to seed by. ``sync`` sets the environment to defer its rewards.
 
     ``track_traj_ids=False`` and ``device=None`` because they are the quickest (measured; see docs/howto-bench.md).
     """
     if settings.kind == "sync":
+        env = make_env(0)
+        if isinstance(env, TransformedEgoPoseEnv):
+            env.defer_rewards()
+        acting = GaussianSampler(policy) if draws_gaussian(policy) else policy
         return Collector(
-            make_env(0),
-            policy,
+            env,
+            acting,
             frames_per_batch=steps_per_iteration,
             total_frames=-1,
             track_traj_ids=False,
             auto_register_policy_transforms=False,
+            postproc=Completion(env, acting),
         )
     return Workers(
         settings.kind,
@@ -131,7 +138,9 @@ def load_simulation_state(collector: Any, state: Mapping[str, Any]) -> None:
         if isinstance(collector, Workers):
             collector.load_simulation_state([state[f"worker{number}"] for number in range(len(state))])
         else:
-            write_simulation(collector, state)
+            # Runs from before rewards were deferred kept the last step's terms among what the policy sees.
+            seen = {key: value for key, value in state["carrier"].items() if not key.startswith("reward_terms.")}
+            write_simulation(collector, {**state, "carrier": seen})
     except (ValueError, KeyError, RuntimeError) as error:
         raise InputError("simulation", "worlds", str(error)) from None
 

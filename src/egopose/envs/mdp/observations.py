@@ -76,12 +76,12 @@ class BodyView:
     @cached_property
     def root_rotation(self) -> Tensor:
         """``[N, 4]`` de-headed, ``conj(heading) * q``: w is never negative, z is zero, whichever sign q comes with."""
-        return rot.multiply(rot.conjugate(self.heading), self.root_quaternion)
+        return rot.turn_back(self.heading, self.root_quaternion)
 
     @cached_property
     def root_linear_velocity(self) -> Tensor:
         """``[N, 3]`` m/s in the heading frame."""
-        return torch.matmul(self.qvel[:, None, :3], self.heading_matrix).squeeze(1)
+        return rot.rotate_back(self.heading, self.qvel[:, :3])
 
     @cached_property
     def root_angular_velocity(self) -> Tensor:

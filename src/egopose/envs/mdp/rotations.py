@@ -66,6 +66,24 @@ def heading(q: Tensor) -> Tensor:
     return kept / torch.linalg.vector_norm(kept, dim=-1, keepdim=True)
 
 
+def turn_back(heading: Tensor, q: Tensor) -> Tensor:
+    """``conj(heading) * q`` of a :func:`heading` and quaternions, both ``[..., 4]``.
+
+    Plain products and sums: unlike matrix products they round alike however many rows there are.
+    """
+    swapped = q.flip(-1) * _constant((1.0, 1.0, -1.0, -1.0), q.dtype, q.device)
+    return heading[..., :1] * q + heading[..., 3:] * swapped
+
+
+def rotate_back(heading: Tensor, v: Tensor) -> Tensor:
+    """Vectors ``[..., 3]`` of the world in the frame of a :func:`heading` ``[..., 4]``; rounds as :func:`turn_back`."""
+    w, z = heading[..., :1], heading[..., 3:]
+    cos, sin = w * w - z * z, 2.0 * w * z
+    x, y, up = v.unbind(-1)
+    x, y = x.unsqueeze(-1), y.unsqueeze(-1)
+    return torch.cat([cos * x + sin * y, cos * y - sin * x, up.unsqueeze(-1)], dim=-1)
+
+
 def half_angle_between(p: Tensor, q: Tensor) -> Tensor:
     """Half the angle ``[...]`` (rad, at most pi/2) of the rotation ``p * conj(q)``, the short way round.
 

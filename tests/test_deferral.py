@@ -1,0 +1,123 @@
+"""Rewards and probabilities worked out for a batch at once are those of its steps."""
+
+from __future__ import annotations
+
+from functools import partial
+
+import pytest
+import torch
+from env_stand_in import environment
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModule, TensorDictModuleBase
+from torch import Tensor, nn
+from torchrl.collectors import Collector
+from torchrl.envs import check_env_specs
+from torchrl.modules import IndependentNormal, ProbabilisticActor
+
+from egopose.envs.transformed import TransformedEgoPoseEnv
+from egopose.envs.transforms import StateNormalizer
+from egopose.training.collectors import (
+    CollectorSettings,
+    build_collector,
+    load_simulation_state,
+    load_transform_state,
+    simulation_state,
+    transform_state,
+)
+
+WORLDS, STEPS = 5, 20
+SETTINGS = CollectorSettings("sync", worlds=WORLDS, physics_threads=1, workers=1, threads=1, update_threads=1)
+
+
+def make_env(number: int = 0) -> TransformedEgoPoseEnv:
+    base = environment(WORLDS, seed=3)
+    return TransformedEgoPoseEnv(base, StateNormalizer(base.observation_spec["humanoid_state"].shape[-1]))
+
+
+class Gaussian(nn.Module):
+    def __init__(self, states: int, actions: int) -> None:
+        super().__init__()
+        self.mean = nn.Linear(states, actions)
+
+    def forward(self, state: Tensor) -> tuple[Tensor, Tensor]:
+        mean = 0.1 * self.mean(state)
+        return mean, torch.full_like(mean, 0.3)
+
+
+def make_actor(env: TransformedEgoPoseEnv) -> TensorDictModuleBase:
+    torch.manual_seed(1)
+    network = Gaussian(env.observation_spec["humanoid_state"].shape[-1], env.action_spec.shape[-1])
+    return ProbabilisticActor(
+        TensorDictModule(network, in_keys=["humanoid_state"], out_keys=["loc", "scale"]),
+        in_keys=["loc", "scale"],
+        distribution_class=IndependentNormal,
+        return_log_prob=True,
+    )
+
+
+def test_a_batch_is_what_torchrls_collector_gives_of_an_environment_that_defers_nothing() -> None:
+    env = make_env()
+    actor = make_actor(env)
+    options = {"frames_per_batch": WORLDS * STEPS, "total_frames": -1, "track_traj_ids": False}
+    theirs = iter(Collector(env, actor, auto_register_policy_transforms=False, **options))
+    torch.manual_seed(2)
+    expected = [next(theirs) for _ in range(2)]
+    mine = iter(build_collector(SETTINGS, make_env, actor, WORLDS * STEPS))
+    torch.manual_seed(2)
+    for batch in expected:
+        got = next(mine)
+        assert batch["next", "done"].any()
+        missing = set(batch.keys(True, True)) - set(got.keys(True, True))
+        assert {key[0] for key in missing} == {"reward_terms"}  # of the step before: nothing reads them
+        assert set(got.keys(True, True)) <= set(batch.keys(True, True))
+        for key in got.keys(True, True):
+            exact = {"rtol": 0, "atol": 0}
+            close = {"rtol": 1e-6, "atol": 1e-6}
+            torch.testing.assert_close(got[key], batch[key], **(close if key == "action_log_prob" else exact))
+
+
+def test_a_diverged_world_earns_nothing_when_its_reward_comes_late() -> None:
+    env = environment(3)
+    env.defer_rewards()
+    td = env.reset()
+    action = torch.zeros(env.action_spec.shape)
+    action[1] = torch.nan
+    assert env.step(td.set("action", action))["next", "reward"].isnan().all()
+    due = env.rewards_due()
+    assert set(due) == {"reward", *env.problem.reward.names}
+    for value in due.values():
+        assert value.shape == (3, 1, 1)
+        assert value[1].item() == 0
+        assert (value[[0, 2]] > 0).all()
+    with pytest.raises(RuntimeError, match="no step waits"):
+        env.rewards_due()
+
+
+def test_an_environment_defers_only_when_told_and_its_specs_follow() -> None:
+    env = make_env()
+    check_env_specs(env)
+    assert "reward_terms" in env.observation_spec
+    env.defer_rewards()
+    assert "reward_terms" not in env.observation_spec
+    assert "reward_terms" not in env.reset()
+
+
+def test_a_state_from_before_rewards_were_deferred_goes_on() -> None:
+    actor = make_actor(make_env())
+    build = partial(build_collector, SETTINGS, make_env, actor, WORLDS * STEPS)
+    first, second = build(), build()
+    batches = iter(first)
+    next(batches)
+    simulation, transforms = simulation_state(first), transform_state(first)
+    old = {**simulation["carrier"], "reward_terms.pose": torch.zeros(WORLDS, 1)}
+    simulation = {"carrier": old, "worlds": simulation["worlds"]}
+    again = iter(second)
+    load_transform_state(second, {key: value.clone() for key, value in transforms.items()})
+    load_simulation_state(second, simulation)
+
+    def go_on(source: object) -> TensorDictBase:
+        torch.manual_seed(4)
+        return next(source)  # type: ignore[call-overload]
+
+    a, b = go_on(batches), go_on(again)
+    assert (a == b).all()
