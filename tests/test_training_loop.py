@@ -17,7 +17,7 @@ from toy_problem import SETTINGS, make_env, make_run, networks
 from egopose.errors import InputError
 from egopose.training.logging import CsvCurves, ProgressLine, build_loggers, git_state
 from egopose.training.loop import Run, experience_figures, iterate, train
-from egopose.training.ppo import PPO, PPOSettings, TrainingDiverged
+from egopose.training.ppo import PPO, PPOSettings, TrainingDiverged, _between_neighbours
 
 
 def state_of(run: Run) -> dict[str, torch.Tensor]:
@@ -229,3 +229,12 @@ def test_missing_setting_names_its_field() -> None:
 def test_unknown_logger_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="kind"):
         build_loggers({"kind": "paper"}, tmp_path, {})
+
+
+def test_an_action_is_compared_with_its_neighbours_of_the_same_episode() -> None:
+    """By hand: five steps, an episode ends with the third; its last and the next one's first have one neighbour."""
+    loc = torch.tensor([[[1.0], [4.0], [2.0], [10.0], [20.0]]])
+    done = torch.tensor([[[False], [False], [True], [False], [False]]])
+    assert _between_neighbours(loc, done)[0, :, 0].tolist() == [4.0, 1.5, 4.0, 20.0, 10.0]
+    alone = torch.ones_like(done)
+    assert torch.equal(_between_neighbours(loc, alone), loc)

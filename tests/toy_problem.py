@@ -33,6 +33,7 @@ SETTINGS: dict[str, Any] = {
     "normalize_advantage": True,
     "target_kl": 0.02,
     "policy_lr_range": [1e-4, 1e-2],
+    "smoothness": 0.0,
     "max_nonfinite": 2,
 }
 LOOP: dict[str, Any] = {

@@ -48,6 +48,8 @@ class PPOSettings:
         target_kl: after each epoch the actor's step size is adapted to keep KL(old || new), over the rows of one
             minibatch, near this; None to keep it.
         policy_lr_range: bounds of the adapted step size.
+        smoothness: weight of the mean action's squared distance (summed over actions, rad^2) from the mean of those a
+            step before and after it; 0 for none.
         max_nonfinite: gradient steps in a row that may be skipped for values that are not finite.
     """
 
@@ -64,6 +66,7 @@ class PPOSettings:
     normalize_advantage: bool
     target_kl: float | None
     policy_lr_range: tuple[float, float]
+    smoothness: float
     max_nonfinite: int
 
     @classmethod
@@ -137,6 +140,9 @@ class PPO:
         self._values(batch)
         self.gae(batch)
         names = [*self.loss.in_keys, *self.actor.out_keys, "state_value", "advantage", "value_target"]
+        if self.settings.smoothness > 0:
+            batch["smooth_loc"] = _between_neighbours(batch["loc"], batch["next", "done"])
+            names.append("smooth_loc")
         rows = batch.select(*[n for n in names if _root(n) != "next"], strict=False)
         rows = rows if self.recurrent else rows.reshape(-1)
         advantage = rows["advantage"]
@@ -220,7 +226,9 @@ class PPO:
         """One step of critic and actor, or None where loss or gradient was not finite and nothing was stepped."""
         with set_recurrent_mode(self.recurrent):
             losses = self.loss(rows)
+            roughness = self._roughness(rows)
         policy_loss = losses["loss_objective"] + losses.get("loss_entropy", 0.0)
+        policy_loss = policy_loss + self.settings.smoothness * roughness
         self.policy_optimizer.zero_grad()
         self.value_optimizer.zero_grad()
         # The networks share nothing, so one backward pass gives both gradients, and the order of the steps is the
@@ -245,11 +253,23 @@ class PPO:
         self.policy_optimizer.step()
         return {
             "policy_loss": policy_loss.detach(),
+            "roughness": roughness.detach(),
             "value_loss": losses["loss_critic"].detach(),
             "clip_fraction": losses["clip_fraction"],
             "policy_grad_norm": policy_norm,
             "value_grad_norm": value_norm,
         }
+
+    def _roughness(self, rows: TensorDictBase) -> Tensor:
+        """Mean squared distance of the mean actions from those of their neighbours, rad^2; zero where it has no weight.
+
+        A policy paid for not falling alone answers every wobble of the state with a jerk (Mysore et al. 2021,
+        "Regularizing action policies for smooth control", eq. 1, with the neighbours' actions as they were collected).
+        """
+        if self.settings.smoothness <= 0:
+            return torch.zeros(())
+        mean = self.actor.get_dist(rows.select(*self.actor.in_keys)).mean
+        return (mean - rows["smooth_loc"]).square().sum(dim=-1).mean()
 
     def _adapt_step_size(self, kl: float) -> None:
         """The actor's step size follows the divergence (Rudin et al. 2022, "Learning to walk in minutes")."""
@@ -262,6 +282,20 @@ class PPO:
                 group["lr"] = max(low, group["lr"] / 1.5)
             elif kl < target / 2:
                 group["lr"] = min(high, group["lr"] * 1.5)
+
+
+def _between_neighbours(loc: Tensor, done: Tensor) -> Tensor:
+    """Mean of the actions ``loc [N, T, A]`` a step before and after each, within its episode; alone, the action itself.
+
+    Args:
+        loc: mean actions.
+        done: ``[N, T, 1]`` whether an episode ends with the step.
+    """
+    before, after = torch.zeros_like(done), torch.zeros_like(done)
+    before[:, 1:] = after[:, :-1] = ~done[:, :-1]
+    total = before * loc.roll(1, dims=1) + after * loc.roll(-1, dims=1)
+    count = before.int() + after.int()
+    return torch.where(count > 0, total / count.clamp_min(1), loc)
 
 
 def _root(key: Any) -> Any:
