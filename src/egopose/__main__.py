@@ -15,6 +15,7 @@ VERBS = {
     "evaluate": "score a checkpoint on held-out takes beside PoseReg: tables, CSV, BVH, side-by-side MP4",
     "estimate": "motion from a video alone: BVH and MP4",
     "export": "motions for other programs: BVH, GLB, AMASS npz, TRC, C3D, OpenSim, CSV",
+    "view": "look at motions, estimates and forecasts in the browser",
     "report": "one HTML page of an evaluation or a sweep: tables, curves, pictures",
     "stream": "motion live from a camera, a video or an address: WebSocket, file, latencies",
     "bench": "measure the environment's and the pipeline's speed",

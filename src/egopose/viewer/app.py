@@ -1,0 +1,267 @@
+"""The viewer: scene, controls and charts around one timeline. All who look at it share what is shown."""
+
+from __future__ import annotations
+
+import io
+import queue
+import threading
+from collections.abc import Callable, Sequence
+from contextlib import redirect_stdout
+from functools import partial
+from typing import Any
+
+import numpy as np
+import viser
+
+from egopose.viewer.clip import Clip, Run
+from egopose.viewer.curves import Chart
+from egopose.viewer.door import Address, Door
+from egopose.viewer.figure import Color, Figure
+from egopose.viewer.player import Player
+from egopose.viewer.wearer import Pictures
+
+_MAIN: Color = (70, 110, 220)
+_OTHER: Color = (235, 140, 40)
+_REFERENCE: Color = (60, 190, 90)
+_STEPS = ((12, 0.34), (24, 0.22), (45, 0.12))  # frames ahead and opacity: a forecast's poses to come
+_NONE = "none"
+_TICK, _CHARTS_EVERY = 1 / 30, 3  # s between pictures; charts and slider follow at a third of that
+_SPEEDS = ("0.1", "0.25", "0.5", "1", "2", "4")
+
+
+class _Server(viser.ViserServer):
+    """Without the tunnel to a public server that any page connected to viser may ask for."""
+
+    def request_share_url(self, verbose: bool = True) -> str | None:
+        return None
+
+
+class Viewer:
+    """Serves until :meth:`close`.
+
+    Args:
+        runs: at least one; the first is shown first.
+        address: where browsers come in.
+
+    Raises:
+        InputError: the address cannot be listened at.
+    """
+
+    def __init__(self, runs: Sequence[Run], address: Address) -> None:
+        self._runs = {run.label: run for run in runs}
+        with redirect_stdout(io.StringIO()):  # its banner names an address that is not the door's
+            self._server = _Server("127.0.0.1", 0, label="egopose", verbose=False)
+        try:
+            self._door = Door(address, self._server.get_port())
+        except Exception:
+            self._server.stop()
+            raise
+        shown = "localhost" if address.host in ("0.0.0.0", "::") else address.host
+        self.url = f"http://{shown}:{self._door.port}/" + (f"?token={address.token}" if address.token else "")
+        self._player = Player()
+        self._asked: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
+        self._figures: dict[str, Figure] = {}
+        self._trail: list[tuple[Figure, int]] = []
+        self._pictures: Pictures | None = None
+        self._build()
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._loop, daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        """Serve no more."""
+        self._stop.set()
+        self._thread.join()
+        if self._pictures is not None:
+            self._pictures.close()
+        self._door.close()
+        self._server.stop()
+
+    def _build(self) -> None:
+        scene, gui = self._server.scene, self._server.gui
+        gui.configure_theme(show_logo=False, show_share_button=False, control_width="large")
+        gui.main_panel.dock_right()
+        scene.set_up_direction("+z")
+        self._world = scene.add_frame("/world", show_axes=False)
+        scene.add_grid("/world/floor", width=20, height=20, cell_color=(215, 215, 215), section_color=(180, 180, 180))
+        self._server.initial_camera.position = (2.6, -2.2, 1.5)
+        self._server.initial_camera.look_at = (0.0, 0.0, 0.9)
+        labels = list(self._runs)
+        self._run: Any = gui.add_dropdown("Run", labels, initial_value=labels[0])
+        self._compare = gui.add_dropdown("Compare", [_NONE, *labels], initial_value=_NONE, visible=len(labels) > 1)
+        takes = list(self._runs[labels[0]].clips)
+        self._take: Any = gui.add_dropdown("Take", takes, initial_value=takes[0])
+        self._frame: Any = gui.add_slider("Frame", 0, 1, 1, 0)
+        self._play = gui.add_button("Play")
+        self._speed = gui.add_dropdown("Speed", _SPEEDS, initial_value="1")
+        self._status = gui.add_markdown("")
+        self._video = gui.add_image(np.zeros((2, 2, 3), np.uint8), label="Wearer's video", visible=False)
+        self._value = Chart(gui, "Value V(s)")
+        self._confidence = Chart(gui, "Fail-safe: confidence, resets")
+        self._errors = gui.add_dropdown("Figure", [_NONE], initial_value=_NONE, visible=False)
+        self._error = Chart(gui, "Figure per frame")
+        self._degrees = gui.add_dropdown("Joint", [_NONE], initial_value=_NONE, visible=False)
+        self._angle = Chart(gui, "Joint angle and its band, rad")
+        with gui.add_folder("Show", expand_by_default=False):
+            self._layers = {n: gui.add_checkbox(n, True) for n in ("reference", "futures", "contacts and torques")}
+            self._follow = gui.add_checkbox("follow", True)
+            self._again = gui.add_checkbox("loop", True)
+
+        def on(handle: Any, action: Callable[[], None]) -> None:
+            # Values set from here call back too; only what a browser asked for is an order. All orders are carried
+            # out by one thread, the one that draws.
+            @handle.on_update
+            def _(event: Any) -> None:
+                if event.client is not None:
+                    self._asked.put(action)
+
+        on(self._run, self._choose_run)
+        on(self._compare, self._load)
+        on(self._take, self._load)
+
+        @self._frame.on_update
+        def _(event: Any) -> None:
+            if event.client is not None:
+                self._asked.put(partial(self._scrub, int(event.target.value)))
+
+        on(self._speed, lambda: setattr(self._player, "speed", float(self._speed.value)))
+        on(self._errors, self._chart_error)
+        on(self._degrees, self._chart_angle)
+        on(self._again, lambda: setattr(self._player, "loop", self._again.value))
+        self._play.on_click(lambda _: self._asked.put(lambda: self._player.play(not self._player.playing)))
+
+    def _loop(self) -> None:
+        self._load()
+        ticks, shown = 0, (-1, False)
+        while not self._stop.wait(_TICK):
+            changed = False
+            while not self._asked.empty():
+                self._asked.get()()
+                changed = True
+            now = (self._player.frame(), self._player.playing)
+            ticks += 1
+            if now != shown or changed or ticks % 30 == 0:
+                self._draw(now[0], slow=changed or not now[1] or ticks % _CHARTS_EVERY == 0)
+            shown = now
+
+    def _clips(self) -> list[tuple[str, Clip, Color]]:
+        """The run shown and the one it is compared with, where both have the take."""
+        found: list[tuple[str, Clip, Color]] = []
+        for label, color in ((self._run.value, _MAIN), (self._compare.value, _OTHER)):
+            run = self._runs.get(label)
+            clip = None if run is None else run.clips.get(self._take.value)
+            if clip is not None and label not in [name for name, _, _ in found]:
+                found.append((label, clip, color))
+        return found
+
+    def _choose_run(self) -> None:
+        takes = list(self._runs[self._run.value].clips)
+        kept = self._take.value if self._take.value in takes else takes[0]
+        self._take.options = takes
+        self._take.value = kept
+        self._load()
+
+    def _scrub(self, frame: int) -> None:
+        self._player.play(False)
+        self._player.seek(frame)
+
+    def _load(self) -> None:
+        """Put the chosen clips into the scene, from their first frame on."""
+        for figure in (*self._figures.values(), *(f for f, _ in self._trail)):
+            figure.remove()
+        if self._pictures is not None:
+            self._pictures.close()
+        clips, scene = self._clips(), self._server.scene
+        _, main, _ = clips[0]
+        self._figures = {
+            label: Figure(scene, f"/world/run{i}", clip.motion, color, marks=True)
+            for i, (label, clip, color) in enumerate(clips)
+        }
+        if main.reference is not None:
+            self._figures["reference"] = Figure(scene, "/world/reference", main.reference, _REFERENCE, 0.35)
+        for k, future in enumerate(main.futures):
+            self._figures[f"future {k}"] = Figure(scene, f"/world/future{k}", future, _MAIN, 0.2)
+        steps = _STEPS if main.forecast else ()
+        self._trail = [
+            (Figure(scene, f"/world/ahead{ahead}", main.motion, _MAIN, opacity), ahead) for ahead, opacity in steps
+        ]
+        self._pictures = None
+        if main.footage is not None:
+            self._pictures = Pictures(main.footage, main.motion.fps, len(main.motion))
+        self._player.load(len(main.motion), main.motion.fps)
+        self._frame.value = 0
+        self._frame.max = max(1, len(main.motion) - 1)
+        self._charts(clips)
+
+    def _charts(self, clips: Sequence[tuple[str, Clip, Color]]) -> None:
+        fps = clips[0][1].motion.fps
+        for chart, name in ((self._value, "value"), (self._confidence, "confidence")):
+            lines = {n: (c.curves[name], _css(color)) for n, c, color in clips if name in c.curves}
+            resets = clips[0][1].curves.get("reset")
+            if name == "confidence" and resets is not None and resets.any():
+                lines["resets"] = (resets, "#d33")
+            chart.set(lines, fps)
+        curves = clips[0][1].curves
+        figures = [n for n in curves if n not in ("value", "confidence", "reset") and np.isfinite(curves[n]).any()]
+        self._offer(self._errors, figures)
+        self._offer(self._degrees, list(clips[0][1].bands))
+        self._chart_error()
+        self._chart_angle()
+
+    def _offer(self, dropdown: Any, names: Sequence[str]) -> None:
+        kept = dropdown.value if dropdown.value in names else (names[0] if names else _NONE)
+        dropdown.options = tuple(names) or (_NONE,)
+        dropdown.value = kept
+        dropdown.visible = bool(names)
+
+    def _chart_error(self) -> None:
+        name, clips = self._errors.value, self._clips()
+        self._error.set({n: (c.curves[name], _css(k)) for n, c, k in clips if name in c.curves}, clips[0][1].motion.fps)
+
+    def _chart_angle(self) -> None:
+        clip, name = self._clips()[0][1], self._degrees.value
+        lines = {}
+        if name in clip.bands:
+            joint, _, k = name.rpartition("_")
+            skeleton = clip.motion.skeleton
+            column = 7 + skeleton.dof_slices[skeleton.names.index(joint)].start + int(k)
+            lines = {edge: (clip.bands[name][edge], "#9ab") for edge in ("high", "low")}
+            lines["forecast"] = (clip.motion.qpos[:, column], _css(_MAIN))
+            if clip.reference is not None and clip.reference.skeleton == skeleton:
+                lines["true"] = (clip.reference.qpos[:, column], _css(_REFERENCE))
+        self._angle.set(lines, clip.motion.fps, ("high", "low"))
+
+    def _draw(self, frame: int, slow: bool) -> None:
+        clips = self._clips()
+        layer = {name: box.value for name, box in self._layers.items()}
+        with self._server.atomic():
+            for name, figure in self._figures.items():
+                group = "reference" if name == "reference" else "futures" if name.startswith("future ") else ""
+                figure.show(frame, layer.get(group, True), layer["contacts and torques"])
+            for figure, ahead in self._trail:
+                figure.show(frame + ahead, layer["futures"])
+            root = self._figures[clips[0][0]].root(frame) if self._follow.value else np.zeros(3)
+            self._world.position = (-root[0], -root[1], 0.0)
+        picture = None if self._pictures is None else self._pictures.at(frame)
+        self._video.visible = picture is not None
+        if picture is not None:
+            self._video.image = picture
+        if not slow:
+            return
+        self._frame.value = frame
+        self._play.label = "Pause" if self._player.playing else "Play"
+        self._status.content = self._line(frame, clips)
+        for chart in (self._value, self._confidence, self._error, self._angle):
+            chart.at(frame)
+
+    def _line(self, frame: int, clips: Sequence[tuple[str, Clip, Color]]) -> str:
+        motion = clips[0][1].motion
+        parts = [f"frame {frame} of {len(motion)}, {frame / motion.fps:.2f} s", f"blue: {clips[0][0]}"]
+        parts += [f"orange: {label}" for label, _, _ in clips[1:]]
+        parts += ["green: reference"] if "reference" in self._figures else []
+        parts += [f"video: {self._pictures.fault}"] if self._pictures is not None and self._pictures.fault else []
+        return "; ".join(parts)
+
+
+def _css(color: Color) -> str:
+    return f"rgb{color}"
