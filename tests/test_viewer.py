@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -242,3 +243,27 @@ def test_in_a_browser_it_loads_plays_scrubs_and_switches(folders: list[Path], pa
         assert all(url.startswith((viewer.url.partition("?")[0], "data:", "blob:")) for url in addresses)
     finally:
         viewer.close()
+
+
+def test_a_stream_is_shown_live() -> None:
+    pytest.importorskip("viser", reason="viser is not installed: pip install 'egopose[view]'")
+    from egopose.inference.stream.body import LivePose
+    from egopose.inference.stream.broadcast import Broadcast, ServerSettings
+    from egopose.inference.stream.messages import frame_json, hello
+    from egopose.viewer.live import LiveViewer
+
+    motion = walk()
+    sent = Broadcast(ServerSettings("127.0.0.1", 0, None, 2, 60), hello(motion.skeleton, 30.0, 10, "test"))
+    viewer = LiveViewer(f"ws://127.0.0.1:{sent.port}/json", Address(port=0))
+    try:
+        deadline = time.monotonic() + 10
+        while viewer.frame < 7 and time.monotonic() < deadline:
+            pose = LivePose(frame=7, qpos=motion.qpos[7], value=1.0, confidence=None, reset=False)
+            sent.send(frame_json(pose, 30.0, 5.0))
+            time.sleep(0.05)
+        assert viewer.frame == 7
+    finally:
+        viewer.close()
+        sent.close()
+    with pytest.raises(InputError, match="stream"):
+        LiveViewer("ws://127.0.0.1:9/json", Address(port=0))

@@ -1,6 +1,7 @@
 """``python -m egopose.view RUN_OR_MOTION [ANOTHER ...]``: look at motions, estimates and forecasts in the browser.
 
 Sources: a motion file, a folder of an estimate, an evaluation's folder or a run directory; several are compared.
+Or `ws://127.0.0.1:8765/json`: what `egopose stream` sends, live.
 """
 
 from __future__ import annotations
@@ -17,8 +18,12 @@ import threading  # noqa: E402
 from collections.abc import Sequence  # noqa: E402
 from importlib.util import find_spec  # noqa: E402
 from pathlib import Path  # noqa: E402
+from typing import TYPE_CHECKING  # noqa: E402
 
 from egopose.errors import InputError  # noqa: E402
+
+if TYPE_CHECKING:
+    from egopose.viewer.live import LiveViewer
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -44,7 +49,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
         token = secrets.token_hex(16) if options.token == "new" else options.token
         address = Address(options.address, options.port, token)
         footage = None if options.video is None else Footage(options.video, options.offset)
-        viewer = Viewer(read_runs(options.sources, footage), address)
+        viewer: Viewer | LiveViewer
+        if options.sources[0].startswith(("ws://", "wss://")):
+            from egopose.viewer.live import LiveViewer
+
+            viewer = LiveViewer(options.sources[0], address)
+        else:
+            viewer = Viewer(read_runs(options.sources, footage), address)
     except InputError as error:
         print(f"error: {error}", file=sys.stderr)
         raise SystemExit(2) from None

@@ -2,22 +2,20 @@
 
 from __future__ import annotations
 
-import io
 import queue
 import threading
 from collections.abc import Callable, Sequence
-from contextlib import redirect_stdout
 from functools import partial
 from typing import Any
 
 import numpy as np
-import viser
 
 from egopose.viewer.clip import Clip, Run
 from egopose.viewer.curves import Chart
-from egopose.viewer.door import Address, Door
+from egopose.viewer.door import Address
 from egopose.viewer.figure import Color, Figure
 from egopose.viewer.player import Player
+from egopose.viewer.serving import furnish, open_server
 from egopose.viewer.wearer import Pictures
 
 _MAIN: Color = (70, 110, 220)
@@ -27,13 +25,6 @@ _STEPS = ((12, 0.34), (24, 0.22), (45, 0.12))  # frames ahead and opacity: a for
 _NONE = "none"
 _TICK, _CHARTS_EVERY = 1 / 30, 3  # s between pictures; charts and slider follow at a third of that
 _SPEEDS = ("0.1", "0.25", "0.5", "1", "2", "4")
-
-
-class _Server(viser.ViserServer):
-    """Without the tunnel to a public server that any page connected to viser may ask for."""
-
-    def request_share_url(self, verbose: bool = True) -> str | None:
-        return None
 
 
 class Viewer:
@@ -49,15 +40,7 @@ class Viewer:
 
     def __init__(self, runs: Sequence[Run], address: Address) -> None:
         self._runs = {run.label: run for run in runs}
-        with redirect_stdout(io.StringIO()):  # its banner names an address that is not the door's
-            self._server = _Server("127.0.0.1", 0, label="egopose", verbose=False)
-        try:
-            self._door = Door(address, self._server.get_port())
-        except Exception:
-            self._server.stop()
-            raise
-        shown = "localhost" if address.host in ("0.0.0.0", "::") else address.host
-        self.url = f"http://{shown}:{self._door.port}/" + (f"?token={address.token}" if address.token else "")
+        self._server, self._door, self.url = open_server(address)
         self._player = Player()
         self._asked: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
         self._figures: dict[str, Figure] = {}
@@ -78,14 +61,8 @@ class Viewer:
         self._server.stop()
 
     def _build(self) -> None:
-        scene, gui = self._server.scene, self._server.gui
-        gui.configure_theme(show_logo=False, show_share_button=False, control_width="large")
-        gui.main_panel.dock_right()
-        scene.set_up_direction("+z")
-        self._world = scene.add_frame("/world", show_axes=False)
-        scene.add_grid("/world/floor", width=20, height=20, cell_color=(215, 215, 215), section_color=(180, 180, 180))
-        self._server.initial_camera.position = (2.6, -2.2, 1.5)
-        self._server.initial_camera.look_at = (0.0, 0.0, 0.9)
+        gui = self._server.gui
+        self._world = furnish(self._server)
         labels = list(self._runs)
         self._run: Any = gui.add_dropdown("Run", labels, initial_value=labels[0])
         self._compare = gui.add_dropdown("Compare", [_NONE, *labels], initial_value=_NONE, visible=len(labels) > 1)
