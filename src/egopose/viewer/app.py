@@ -47,6 +47,8 @@ class Viewer:
         self._trail: list[tuple[Figure, int]] = []
         self._pictures: Pictures | None = None
         self._build()
+        # Here and not on the thread: the first figure reads conf/humanoid, and Hydra composes for one thread at a time.
+        self._load()
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._loop, daemon=True)
         self._thread.start()
@@ -108,7 +110,6 @@ class Viewer:
         self._play.on_click(lambda _: self._asked.put(lambda: self._player.play(not self._player.playing)))
 
     def _loop(self) -> None:
-        self._load()
         ticks, shown = 0, (-1, False)
         while not self._stop.wait(_TICK):
             changed = False

@@ -83,7 +83,7 @@ class LiveViewer:
             self._mesh.vertices = self._surface.posed(*(x[0] for x in forward_kinematics(self._skeleton, qpos)))
             self._world.position = (-qpos[0, 0], -qpos[0, 1], 0.0)
             self._status.content = f"live, frame {self.frame}, {newest['delay_ms']:.0f} ms behind"
-            if self.frame % 15 == 0:
+            if self.frame % 60 == 0:
                 for name, chart in self._charts.items():
                     chart.set({name: (np.array(self._past[name]), "rgb(70,110,220)")}, self._fps)
         self._status.content = f"ended after frame {self.frame}"
