@@ -25,7 +25,17 @@ from importlib import import_module  # noqa: E402
 from egopose.errors import InputError  # noqa: E402
 
 #: Verbs and how many rounds each takes unless told; a verb's module is ``egopose.benchmarks.<verb>``.
-VERBS = {"env": 9, "update": 5, "resume": 50, "features": 9, "scaling": 5, "rates": 3, "export": 1, "sync": 8, "stream": 1}
+VERBS = {
+    "env": 9,
+    "update": 5,
+    "resume": 50,
+    "features": 9,
+    "scaling": 5,
+    "rates": 3,
+    "export": 1,
+    "sync": 8,
+    "stream": 1,
+}
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -36,7 +46,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("verb", choices=list(VERBS))
     parser.add_argument("overrides", nargs="*", metavar="key=value", help="of the training configuration")
     parser.add_argument("--json", action="store_true", help="one JSON object on standard output")
-    parser.add_argument("--rounds", type=int, help="rounds (env, update, features, scaling), kills (resume), lengths (stream)")
+    parser.add_argument("--rounds", type=int, help="how often: rounds, or kills (resume), or lengths (stream)")
     options = parser.parse_intermixed_args(arguments)
     verb = import_module(f"egopose.benchmarks.{options.verb}")
     try:
