@@ -187,7 +187,9 @@ def test_late_frames_are_skipped_and_nothing_piles_up(walk: Path) -> None:
     frames = [pose.frame for pose in poses]
     assert frames == sorted(set(frames))
     # In step with time: control frames passed, not pictures seen. What is not there yet is the look-ahead.
-    assert frames[-1] == pytest.approx(30 * last["seconds"] - LOOKAHEAD, abs=8)
+    passed = last["used"] + last["bridged"] + last["lost"]
+    assert frames[-1] == passed - 1 - LOOKAHEAD
+    assert passed > 1.5 * last["used"]
 
 
 def test_a_stop_from_outside_ends_it_at_once(walk: Path) -> None:

@@ -139,7 +139,12 @@ def load_simulation_state(collector: Any, state: Mapping[str, Any]) -> None:
             collector.load_simulation_state([state[f"worker{number}"] for number in range(len(state))])
         else:
             # Runs from before rewards were deferred kept the last step's terms among what the policy sees.
-            seen = {key: value for key, value in state["carrier"].items() if not key.startswith("reward_terms.")}
+            here = simulation_state(collector)["carrier"]
+            seen = {
+                key: value
+                for key, value in state["carrier"].items()
+                if key in here or not key.startswith("reward_terms.")
+            }
             write_simulation(collector, {**state, "carrier": seen})
     except (ValueError, KeyError, RuntimeError) as error:
         raise InputError("simulation", "worlds", str(error)) from None
