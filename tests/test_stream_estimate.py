@@ -188,7 +188,8 @@ def test_late_frames_are_skipped_and_nothing_piles_up(walk: Path) -> None:
     assert frames == sorted(set(frames))
     # In step with time: control frames passed, not pictures seen. What is not there yet is the look-ahead.
     passed = last["used"] + last["bridged"] + last["lost"]
-    assert frames[-1] == passed - 1 - LOOKAHEAD
+    # Frames jumped over within the last look-ahead push the last pose back by as many.
+    assert passed - 1 - LOOKAHEAD - last["lost"] <= frames[-1] <= passed - 1 - LOOKAHEAD
     assert passed > 1.5 * last["used"]
 
 

@@ -165,7 +165,7 @@ def main(config: DictConfig) -> None:
         values = resolved(config)
         given = values["checkpoint"]
         paths = [str(p) for p in given] if isinstance(given, list) else [str(given)]
-        overrides = physics_group(values["sim"])
+        overrides = physics_group(values["physics"])
         agents = [load_agent(path, which=str(values["which"]), overrides=overrides) for path in paths]
         names, videos = take_videos(agents[0].config)
         out = output_folder(values["out"], agents[0].path, str(values["split"]))
