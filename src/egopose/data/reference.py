@@ -82,12 +82,7 @@ def supported(humanoid: HumanoidModel, states: TensorDict, contacts: np.ndarray,
         contacts: ``[T, K]`` of the sole points.
         fps: frames per second.
     """
-    com_z = states["com"][:, 2].numpy()
-    window = max(1, round(0.1 * fps))
-    kernel = np.ones(2 * window + 1) / (2 * window + 1)
-    acceleration = np.gradient(np.gradient(com_z)) * fps**2 if len(com_z) > 1 else np.zeros(1)
-    smooth = np.convolve(np.pad(acceleration, window, mode="edge"), kernel, mode="valid")
-    falls = smooth < -0.5 * 9.81
+    falls = falls_freely(states["com"].numpy(), fps)
     lowest = states["xpos"][:, :, 2].numpy().min(axis=1)
     # Hands, knees or seat on the floor: some joint is as low as a sole's joint ever is.
     near_floor = lowest < _LOW_JOINT
