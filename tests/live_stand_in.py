@@ -10,14 +10,9 @@ import numpy as np
 import torch
 from env_stand_in import group
 
-from egopose.config import from_mapping
+from egopose.benchmarks.stream import untrained_on
 from egopose.data.preparation import humanoid_of
-from egopose.pipeline import build_env, build_networks
-from egopose.stream import Trained, two_frames
-from egopose.training.fragments import Span
-from egopose.training.regressor_settings import RegressorSettings
-from egopose.training.supervised import build_regressor
-from egopose.vision.encoders import build_encoder
+from egopose.stream import Trained
 from egopose.vision.video import write_video
 
 
@@ -43,14 +38,7 @@ def untrained(model: str = "fast", task: str = "residual", cross_fit: int = 1, s
     # Around standing, with so much spread that what is seen makes a difference.
     states = 0.3 * torch.randn(300, 2 * humanoid.mj_model.nq - 3)
     states[:, 0], states[:, 1] = 0.95, 1.0
-    encoder = build_encoder(config["vision"]["encoder"])
-    settings = from_mapping(RegressorSettings, config["regressor"], "conf/regressor")
-    regressor = build_regressor(encoder, states, [Span(0, len(states))], settings, encoder.features).eval()
-    made_with = {"vision": config["vision"], "regressor": config["regressor"]}
-    material = two_frames(humanoid, regressor, made_with)
-    env = build_env(config, material, "test", worlds=1, whole_fragments=True, falls_end=False)
-    actor, critic = build_networks(config, material, env)
-    return Trained(humanoid, regressor, made_with, env, actor.eval(), critic.eval(), config)
+    return untrained_on(config, humanoid, states)
 
 
 def write_walk(path: Path, frames: int, fps: float = 30.0) -> Path:

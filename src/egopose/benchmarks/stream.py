@@ -11,6 +11,9 @@ from typing import TYPE_CHECKING, Any
 from egopose.errors import InputError
 
 if TYPE_CHECKING:
+    from torch import Tensor
+
+    from egopose.humanoid.model import HumanoidModel
     from egopose.stream import Trained
 
 _PREFIX = "stream."
@@ -102,9 +105,21 @@ def untrained(config: Mapping[str, Any]) -> Trained:
     """
     import torch
 
-    from egopose.config import from_mapping
     from egopose.data.preparation import humanoid_of, prepare
     from egopose.envs.mdp.observations import humanoid_state
+
+    torch.manual_seed(0)
+    states = humanoid_state(prepare(config, progress=False, flow=False).reference).float()
+    return untrained_on(config, humanoid_of(config), states)
+
+
+def untrained_on(config: Mapping[str, Any], humanoid: HumanoidModel, states: Tensor) -> Trained:
+    """As :func:`untrained`, with a regressor that knows the mean and spread of ``states [F, S]``; draws random weights.
+
+    Raises:
+        InputError: a setting is wrong.
+    """
+    from egopose.config import from_mapping
     from egopose.pipeline import build_env, build_networks
     from egopose.stream import Trained, two_frames
     from egopose.training.fragments import Span
@@ -112,9 +127,6 @@ def untrained(config: Mapping[str, Any]) -> Trained:
     from egopose.training.supervised import build_regressor
     from egopose.vision.encoders import build_encoder
 
-    torch.manual_seed(0)
-    humanoid = humanoid_of(config)
-    states = humanoid_state(prepare(config, progress=False, flow=False).reference).float()
     encoder = build_encoder(config["vision"]["encoder"])
     settings = from_mapping(RegressorSettings, config["regressor"], "conf/regressor")
     regressor = build_regressor(encoder, states, [Span(0, len(states))], settings, encoder.features).eval()
