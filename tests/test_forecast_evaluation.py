@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import csv
+import html
 import json
+import re
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -30,6 +32,7 @@ from egopose.inference.context_states import context_states
 from egopose.models.regressor import StateRegressor
 from egopose.motion.io import read_motion
 from egopose.motion.motion import Motion
+from egopose.report import evaluation_report
 from egopose.training.fragments import Span
 from egopose.training.predictions import predict_span
 from egopose.vision.video import probe_video, write_video
@@ -137,6 +140,35 @@ def test_everything_is_written_and_agrees(agent: pipeline.Agent, tmp_path: Path)
     assert not (out / "windows/walk_1_12/futures.mp4").exists()
     for word in ("E_pose", "nominal 80%", str(out)):
         assert word in text
+    still_pose = read_motion(folder / "other_standing_still.npz").qpos
+    assert np.ptp(still_pose, axis=0).max() == 0
+    seen = json.loads((folder / "wearer.json").read_text())
+    assert (Path(seen["video"]), seen["rendered"]) == (video.path.resolve(), True)
+    assert seen["start"] == pytest.approx(9 / 30)  # the first frame that was not seen
+    assert not (out / "windows/bow_0/wearer.json").exists()
+    _check_page(evaluation_report(out, agent.material.humanoid, ["evaluation.size=64"]), saved)
+    (folder / "forecast.npz").unlink()
+    with pytest.raises(InputError, match="evaluate anew"):
+        evaluation_report(out, None)
+    (out / "results.json").write_text(json.dumps({**saved, "figures": {"ours": {}}}))
+    with pytest.raises(InputError, match=r"damaged|evaluate anew"):
+        evaluation_report(out, None)
+
+
+def _check_page(path: Path, saved: dict[str, Any]) -> None:
+    """It holds all it shows: figures in full, a line a method, strips of worst and best windows, the command."""
+    text = path.read_text()
+    assert "http:" not in text
+    assert "https:" not in text
+    held = re.search(r'<script type="application/json" id="data">(.*?)</script>', text)
+    assert held is not None
+    assert json.loads(held[1]) == saved
+    for method in ("ours", "standing still"):
+        assert f'data-value="{saved["figures"][method]["E_pose"][0]["value"]!r}"' in text
+    assert text.count('class="band"') >= 3 * 4 + 1  # three metrics of four methods, and the spread over windows
+    assert text.count("<img ") == 4  # two of the four windows are the worst, two the best
+    assert html.escape(saved["command"]) in text
+    assert "rendered from real motion capture" in text
 
 
 def test_bad_settings_are_named(agent: pipeline.Agent, tmp_path: Path) -> None:

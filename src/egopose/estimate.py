@@ -182,7 +182,7 @@ def run_estimate(config: Mapping[str, Any], agent: Agent, pose_motion: Motion, v
     """
     import torch
 
-    from egopose.evaluation.report import TakeVideo, write_motion_files, write_side_by_side
+    from egopose.evaluation.report import TakeVideo, write_footage, write_motion_files, write_side_by_side
     from egopose.evaluation.tables import write_columns_csv
     from egopose.inference.estimator import estimate_takes
     from egopose.inference.failsafe import FailSafe, FailSafeSettings
@@ -202,6 +202,7 @@ def run_estimate(config: Mapping[str, Any], agent: Agent, pose_motion: Motion, v
     motions = {"estimate": motion, "PoseReg": pose_motion}
     camera = Camera.from_mapping(config["camera"], "camera")
     seen = TakeVideo(video, float(config["offset"]), rendered=False, taken_at=camera.fps)
+    write_footage(out, seen, 0, motion.fps)
     write_side_by_side(out / "side_by_side.mp4", humanoid, motions, seen, 0, int(config["size"]))
     print(f"{len(motion)} frames, {estimate.n_resets} resets by the fail-safe; written to {out}", flush=True)
     return out

@@ -109,6 +109,8 @@ def run_evaluation(
     for number, (fragment, result) in enumerate(zip(fragments, runs[0], strict=True)):
         folder = report.write_take(out / "takes", result)
         video = videos[fragment.take]
+        if video is not None:
+            report.write_footage(folder, video, fragment.start, result.motion.fps)
         if video is None or (shown is not None and number >= shown):
             continue
         path = folder / "side_by_side.mp4"
@@ -173,8 +175,8 @@ def main(config: DictConfig) -> None:
             from egopose.forecast_evaluation import run_forecast_evaluation
 
             print(run_forecast_evaluation(values, agents, names, videos, out), flush=True)
-            return
-        print(summary(run_evaluation(values, agents, names, videos, out)), flush=True)
+        else:
+            print(summary(run_evaluation(values, agents, names, videos, out)), flush=True)
         if values["report"]:
             from egopose.report import evaluation_report
 

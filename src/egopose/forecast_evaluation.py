@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import shlex
+import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,14 +19,16 @@ from egopose.envs.starts import FragmentLike
 from egopose.errors import InputError
 from egopose.evaluation import forecast_report as report
 from egopose.evaluation import tables
+from egopose.evaluation.forecast_report import other_file
 from egopose.evaluation.forecasting import ForecastWindow, forecast_windows, score_forecasts, true_futures
-from egopose.evaluation.report import RENDERED_NOTE, TakeVideo, file_name, write_motion_files
+from egopose.evaluation.report import RENDERED_NOTE, TakeVideo, file_name, write_footage, write_motion_files
 from egopose.forecast_contexts import SOURCES, past_states
 from egopose.inference.bands import Bands, fit_scale, quantile_bands
 from egopose.inference.failsafe import FailSafeSettings
 from egopose.inference.forecaster import Forecasts, forecast, placed_states
 from egopose.material import Material
 from egopose.models.baselines.recurrent import RecurrentForecaster
+from egopose.motion.io import write_motion
 from egopose.motion.motion import Motion
 from egopose.motion.rotations import Array
 
@@ -105,16 +109,19 @@ def run_forecast_evaluation(
 
     methods: dict[str, list[Any]] = {OURS: [], DRAWN: [], STILL: []}
     coverage, futures = [], []
+    others: dict[str, Array] = {}  # of the first run: [W, H, nq] of whatever it is compared with
     for number, agent in enumerate(agents):
         pasts = _pasts(config, agent, windows, settings)
         for name, run in compared.items() if number == 0 else ():
             told = _baseline_futures(agent, windows, pasts, str(run))
             methods[name] = [score_forecasts(truth, windows, told, hands, fps)]
+            others[name] = told[:, 0]
         states = _starts(agent, windows, pasts)
         mean = forecast_windows_of(agent, windows, states, 1, settings, int(config["threads"]))
         methods[OURS].append(score_forecasts(truth, windows, mean.qpos, hands, fps))
         still = states[0].numpy()[:, None, None].repeat(windows[0].horizon, axis=2)
         methods[STILL].append(score_forecasts(truth, windows, still, hands, fps))
+        others.setdefault(STILL, still[:, 0])
         drawn, bands = None, None
         if settings.samples > 1:
             drawn = forecast_windows_of(agent, windows, states, settings.samples, settings, int(config["threads"]))
@@ -138,6 +145,7 @@ def run_forecast_evaluation(
         *([RENDERED_NOTE] if rendered else []),
     ]
     about = {
+        "command": shlex.join(sys.orig_argv),
         "checkpoints": [str(agent.path) for agent in agents],
         "split": split,
         "rendered_video": rendered,
@@ -145,9 +153,10 @@ def run_forecast_evaluation(
         "fallen_share": [float(mean.fallen.mean()) for mean, _, _ in futures],
         "diverged": [int(mean.diverged.sum()) for mean, _, _ in futures],
         "coverage": coverage,
+        "notes": notes,
     }
     report.write_forecast_results(out, comparison, methods, windows, labels, about, notes)
-    written = _write_windows(out, config, material, windows, labels, truth, futures[0], videos)
+    written = _write_windows(out, config, material, windows, labels, truth, futures[0], others, videos)
     header, body = report.rows(comparison)
     widths = [max(len(line[i]) for line in [header, *body]) for i in range(len(header))]
     table = "\n".join("  ".join(c.ljust(w) for c, w in zip(line, widths, strict=True)) for line in [header, *body])
@@ -281,6 +290,7 @@ def _write_windows(
     labels: Sequence[str],
     truth: Array,
     futures: tuple[Forecasts, Forecasts | None, Bands | None],
+    others: Mapping[str, Array],
     videos: Sequence[TakeVideo | None],
 ) -> list[Path]:
     """Motions and bands of each window, and videos of the first ones; returns the videos."""
@@ -296,15 +306,19 @@ def _write_windows(
         motions |= {} if drawn is None else {f"future_{k}": drawn.qpos[w, k] for k in range(min(3, len(drawn.qpos[w])))}
         for name, qpos in motions.items():
             write_motion_files(folder, name, Motion(humanoid.skeleton, qpos, fps, f"{label} {name}"))
+        for name, told in others.items():
+            write_motion(Motion(humanoid.skeleton, told[w], fps, f"{label} {name}"), folder / other_file(name))
+        if (video := videos[window.take]) is not None:
+            write_footage(folder, video, window.now + 1, fps)
         if bands is not None:
             edges = {"low": bands.low[w], "median": bands.median[w], "high": bands.high[w]}
             columns = {f"{dof_names[d]}_{edge}": v[:, i] for i, d in enumerate(used) for edge, v in edges.items()}
             tables.write_columns_csv(folder / "bands.csv", columns)
         if shown is not None and w >= shown:
             continue
-        others = np.zeros((0, *truth[w].shape)) if drawn is None else drawn.qpos[w, :3]
+        around = np.zeros((0, *truth[w].shape)) if drawn is None else drawn.qpos[w, :3]
         path = folder / "futures.mp4"
         size = int(config["video"]["size"])
-        report.write_futures_video(path, humanoid, window, mean.qpos[w, 0], truth[w], others, videos[window.take], size)
+        report.write_futures_video(path, humanoid, window, mean.qpos[w, 0], truth[w], around, video, size)
         written.append(path)
     return written

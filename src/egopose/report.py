@@ -25,12 +25,17 @@ _SOURCE = "conf/report.yaml"
 
 
 def evaluation_report(folder: Path, humanoid: HumanoidModel | None, overrides: Sequence[str] = ()) -> Path:
-    """Write the page of an evaluation's folder; see :func:`egopose.evaluation.html_report.write_report`."""
+    """Write the page of an evaluation's folder: :func:`egopose.evaluation.html_report.write_report`'s, or of forecasts
+    :func:`egopose.evaluation.forecast_page.write_forecast_page`'s."""
+    from egopose.evaluation.forecast_page import write_forecast_page
     from egopose.evaluation.html_report import ReportSettings, write_report
+    from egopose.untrusted import read_json
 
     config = compose_config("report", overrides)
     settings = from_mapping(ReportSettings, config["evaluation"], f"{_SOURCE}: evaluation")
-    return write_report(folder, humanoid, settings, _out(config, folder))
+    results = read_json(folder / "results.json", "results")
+    write = write_forecast_page if isinstance(results, dict) and "horizons_s" in results else write_report
+    return write(folder, humanoid, settings, _out(config, folder))
 
 
 def run_report(folder: Path, overrides: Sequence[str] = ()) -> Path:

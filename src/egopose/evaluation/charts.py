@@ -20,24 +20,30 @@ _MOST_POINTS = 800
 
 @dataclass(frozen=True)
 class Line:
-    """A curve: ``x [N]`` and ``y [N]``; where y is not finite the line is broken."""
+    """A curve: ``x [N]`` and ``y [N]``; where y is not finite the line is broken. ``band [2, N]``: its low and high."""
 
     label: str
     x: ArrayLike
     y: ArrayLike
+    band: ArrayLike | None = None
 
 
-def line_chart(lines: Sequence[Line], x_label: str, y_label: str, marks: ArrayLike = ()) -> str:
+def line_chart(
+    lines: Sequence[Line], x_label: str, y_label: str, marks: ArrayLike = (), order: Sequence[str] | None = None
+) -> str:
     """An SVG of curves with legend, axes and ticks.
 
     Args:
-        lines: at least one with a finite point; colours follow the order and begin anew after eight.
+        lines: at least one with a finite point.
         x_label, y_label: with units.
         marks: x of dashed vertical lines.
+        order: labels in the order colours are given in, for charts of which some lack lines; the lines' by default.
     """
     xs = [np.asarray(line.x, dtype=np.float64) for line in lines]
     ys = [np.asarray(line.y, dtype=np.float64) for line in lines]
-    finite = np.concatenate([y[np.isfinite(y)] for y in ys]) if ys else np.empty(0)
+    bands = [None if line.band is None else np.asarray(line.band, dtype=np.float64) for line in lines]
+    drawn = [*ys, *(band.ravel() for band in bands if band is not None)]
+    finite = np.concatenate([y[np.isfinite(y)] for y in drawn]) if drawn else np.empty(0)
     if not len(finite):
         return f"<p>{escape(y_label)}: no figures.</p>"
     every_x = np.concatenate(xs)
@@ -48,16 +54,24 @@ def line_chart(lines: Sequence[Line], x_label: str, y_label: str, marks: ArrayLi
     parts = _axes(x_low, x_high, y_low, y_high, x_label, y_label)
     for x in np.asarray(marks, dtype=np.float64):
         parts.append(f'<path class="mark" d="M{to_x(x):.1f} {_TOP}V{_HEIGHT - _BOTTOM}"/>')
-    for k, (line, x, y) in enumerate(zip(lines, xs, ys, strict=True)):
-        colour = COLOURS[k % len(COLOURS)]
+    labels = [line.label for line in lines]
+    colours = _colours(labels, order)
+    for line, x, y, band in zip(lines, xs, ys, bands, strict=True):
+        colour = colours[line.label]
         step = -(-len(x) // _MOST_POINTS)
+        if band is not None:
+            area = _area(x[::step], band[:, ::step], to_x, to_y)
+            parts.append(f'<path class="band" fill="{colour}" fill-opacity=".15" d="{area}"/>')
         path = _path(x[::step], y[::step], to_x, to_y)
         parts.append(f'<path class="line" stroke="{colour}" d="{path}"><title>{escape(line.label)}</title></path>')
-    return _svg(parts, _HEIGHT) + _legend([line.label for line in lines])
+    return _svg(parts, _HEIGHT) + _legend(colours)
 
 
-def bar_chart(groups: Sequence[str], bars: Mapping[str, ArrayLike], y_label: str) -> str:
-    """An SVG of bars, a group a name, a bar in each group for every series ``[groups]``."""
+def bar_chart(
+    groups: Sequence[str], bars: Mapping[str, ArrayLike], y_label: str, order: Sequence[str] | None = None
+) -> str:
+    """An SVG of bars, a group a name, a bar in each group for every series ``[groups]``; ``order`` as of lines."""
+    colours = _colours(list(bars), order)
     series = {label: np.asarray(values, dtype=np.float64) for label, values in bars.items()}
     height = _HEIGHT + 60  # names stand on end below the axis
     floor = height - _BOTTOM - 60
@@ -82,9 +96,9 @@ def bar_chart(groups: Sequence[str], bars: Mapping[str, ArrayLike], y_label: str
             said = escape(f"{group}, {label}: {values[g]:.4g}")
             parts.append(
                 f'<rect x="{left + 0.1 * slot + k * width:.1f}" y="{y:.1f}" width="{width:.1f}"'
-                f' height="{max(floor - y, 0):.1f}" fill="{COLOURS[k % len(COLOURS)]}"><title>{said}</title></rect>'
+                f' height="{max(floor - y, 0):.1f}" fill="{colours[label]}"><title>{said}</title></rect>'
             )
-    return _svg(parts, height) + _legend(list(series))
+    return _svg(parts, height) + _legend(colours)
 
 
 def ticks(low: float, high: float, most: int = 6) -> NDArray[np.float64]:
@@ -147,13 +161,24 @@ def _path(x: NDArray[np.float64], y: NDArray[np.float64], to_x: _Scale, to_y: _S
     return "".join(out)
 
 
+def _area(x: NDArray[np.float64], band: NDArray[np.float64], to_x: _Scale, to_y: _Scale) -> str:
+    """The ground between two curves, where both are finite."""
+    there = np.isfinite(band).all(axis=0)
+    low, high = (_path(x[there], edge[there], to_x, to_y) for edge in band)
+    back = "L".join(reversed(high.removeprefix("M").split("L")))
+    return f"{low}L{back}Z" if there.any() else ""
+
+
 def _svg(parts: Sequence[str], height: int) -> str:
     return f'<svg viewBox="0 0 {_WIDTH} {height}" role="img">{"".join(parts)}</svg>'
 
 
-def _legend(labels: Sequence[str]) -> str:
-    keys = (
-        f'<span><i style="background:{COLOURS[k % len(COLOURS)]}"></i>{escape(label)}</span>'
-        for k, label in enumerate(labels)
-    )
+def _colours(labels: Sequence[str], order: Sequence[str] | None) -> dict[str, str]:
+    """Label -> colour, by its place in ``order``; anew after eight."""
+    places = list(labels if order is None else order)
+    return {label: COLOURS[places.index(label) % len(COLOURS)] for label in labels}
+
+
+def _legend(colours: Mapping[str, str]) -> str:
+    keys = (f'<span><i style="background:{colour}"></i>{escape(label)}</span>' for label, colour in colours.items())
     return f'<p class="legend">{"".join(keys)}</p>'

@@ -13,7 +13,7 @@ import numpy as np
 from egopose.evaluation import tables
 from egopose.evaluation.compose import middle_square
 from egopose.evaluation.forecasting import METRICS, ForecastScores, ForecastWindow
-from egopose.evaluation.report import TakeVideo
+from egopose.evaluation.report import TakeVideo, file_name
 from egopose.evaluation.statistics import Interval, mean_interval, ratio_interval
 from egopose.humanoid.model import HumanoidModel
 from egopose.motion.rotations import Array
@@ -22,7 +22,8 @@ from egopose.vision.rendering import label_frame
 from egopose.vision.video import Frame, iter_frames, write_video
 
 _UNITS = {"E_pose": "rad", "E_vel": "", "A_accl": ""}
-_TRUTH, _FUTURE = (0.2, 0.75, 0.3, 0.45), (0.3, 0.45, 0.9, 0.25)  # rgba: the true motion green, other futures blue
+#: rgba: the true motion green, other futures blue.
+TRUTH_COLOUR, FUTURE_COLOUR = (0.2, 0.75, 0.3, 0.45), (0.3, 0.45, 0.9, 0.25)
 
 #: method -> its runs (training seeds); a future by the mean action, or figures of several drawn ones.
 Methods = Mapping[str, Sequence[ForecastScores]]
@@ -141,6 +142,11 @@ def write_forecast_results(
                             writer.writerow([*place, *(f"{cell:.8g}" for cell in cells)])
 
 
+def other_file(method: str) -> str:
+    """Where a window's folder keeps the future that another method tells."""
+    return f"other_{file_name(method)}.npz"
+
+
 def write_futures_video(
     path: Path,
     humanoid: HumanoidModel,
@@ -167,7 +173,7 @@ def write_futures_video(
         RuntimeError: no OpenGL here.
     """
     fps = 1.0 / humanoid.control_dt
-    ghosts = [(truth, _TRUTH), *((future, _FUTURE) for future in drawn)]
+    ghosts = [(truth, TRUTH_COLOUR), *((future, FUTURE_COLOUR) for future in drawn)]
     bodies = ghost_frames(humanoid.mj_model, mean, ghosts, "forecast (green: true)", size)
     write_video(path, _beside(bodies, _last_seen(window, video, fps, size)), fps)
 

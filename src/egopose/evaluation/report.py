@@ -18,6 +18,7 @@ from egopose.motion.motion import Motion
 from egopose.vision.video import iter_frames, write_video
 
 OURS, BASELINE = "ours", "PoseReg"
+FOOTAGE = "wearer.json"
 RENDERED_NOTE = "The wearer's video was rendered from real motion capture, not filmed."
 HEADLINE = ("E_pose", "E_vel", "A_accl", "mpjpe_root_aligned", "root_drift", "foot_skate", "contact_accuracy")
 
@@ -83,6 +84,24 @@ def write_take(folder: Path, result: FragmentResult) -> Path:
     write_motion_files(folder, "reference", result.reference)
     write_motion(result.pose_regression, folder / "pose_regression.npz")
     return folder
+
+
+def write_footage(folder: Path, video: TakeVideo, start: int, fps: float) -> None:
+    """``wearer.json``: where the wearer's video of what lies in ``folder`` is, and how it fits.
+
+    Args:
+        folder: of a take or a window.
+        video: of the take.
+        start: frame of the take that the folder's motions begin at. fps: of the motions.
+    """
+    found = {
+        "video": str(video.path.resolve()),
+        "sync_offset": video.sync_offset,
+        "start": start / fps,
+        "taken_at": video.taken_at,
+        "rendered": video.rendered,
+    }
+    tables.write_json(folder / FOOTAGE, found)
 
 
 def write_motion_files(folder: Path, name: str, motion: Motion) -> None:
