@@ -29,6 +29,7 @@ FRAMES = 24
 EVALUATE = {
     "split": "test",
     "failsafe": {"mode": "value", "kappa": 0.6, "fallen_height": 0.3},
+    "failsafe_report": {"window": 5},
     "contact": {"height": 0.03, "speed": 0.5},
     "interval": {"level": 0.95, "draws": 50, "seed": 0},
     "survival": {"worlds": 3, "seed": 1},
@@ -89,6 +90,10 @@ def test_everything_is_written_and_agrees(agent: pipeline.Agent, tmp_path: Path)
     # The untrained policy is its own start: the same networks from the same seed, the same starts.
     assert saved["survival"][0]["policy"]["frames"] > 0
 
+    guarded = saved["failsafe"][0]
+    assert (guarded["mode"], guarded["kappa"], guarded["window_frames"]) == ("value", 0.6, 5)
+    assert [len(take["confidence"]) for take in guarded["takes"]] == [FRAMES - 4, 12]
+
     take = tmp_path / "out/takes/walk_1_4-24"
     with (take / "frames.csv").open() as stream:
         rows = list(csv.DictReader(stream))
@@ -98,6 +103,8 @@ def test_everything_is_written_and_agrees(agent: pipeline.Agent, tmp_path: Path)
     clip = read_motion(take / "estimate.npz")
     positions = read_motion(take / "estimate.bvh").forward_kinematics()[0]
     np.testing.assert_allclose(positions, clip.forward_kinematics()[0], atol=1e-3)
+    assert clip.confidence is not None
+    np.testing.assert_allclose(clip.confidence, [float(r["confidence"]) for r in rows], rtol=1e-6)
     assert probe_video(take / "side_by_side.mp4").width == 3 * 64
     assert results.videos == [take / "side_by_side.mp4"]
     text = summary(results)

@@ -20,14 +20,16 @@ from hydra import compose, initialize_config_dir
 from egopose.config import compose_config, config_dir
 from egopose.errors import InputError
 from egopose.evaluation import page
-from egopose.evaluation.agents import FragmentResult
+from egopose.evaluation.agents import FragmentResult, failsafe_figures
 from egopose.evaluation.charts import Line, bar_chart, line_chart, ticks
 from egopose.evaluation.html_report import ReportSettings, read_takes, worst_and_best, write_report
 from egopose.evaluation.protocols import METRICS, ContactSettings, score_take
 from egopose.evaluation.report import compare_runs, write_results, write_take
+from egopose.evaluation.triggers import take_triggers
 from egopose.humanoid.config import HumanoidConfig, SimConfig
 from egopose.humanoid.model import HumanoidModel, build_humanoid
 from egopose.inference.estimator import Estimate
+from egopose.inference.failsafe import FailSafeSettings
 from egopose.motion.motion import Motion
 from egopose.report import main, run_report
 
@@ -118,6 +120,7 @@ def evaluation(humanoid: HumanoidModel, tmp_path_factory: pytest.TempPathFactory
         "rendered_video": True,
         "settings": {"interval": {"level": 0.95}},
         "survival": [{"policy": {"frames": 12.5, "fell": 0.25}}],
+        "failsafe": [failsafe_figures(run, FailSafeSettings("value", 0.164, 0.3), 30) for run in runs],
     }
     write_results(folder, compare_runs(runs, 0.95, 50, 0), runs, about)
     for result in runs[0]:
@@ -139,9 +142,10 @@ def _result(humanoid: HumanoidModel, name: str, take: int, seed: int) -> Fragmen
     made = [Motion(humanoid.skeleton, q, 30.0, name) for q in (truth, estimate, regressed)]
     resets = np.arange(FRAMES) == 12
     values = np.linspace(0.5, 1.5, FRAMES)
-    found = Estimate(0, estimate, values, values, resets, resets, 0)
+    found = Estimate(0, estimate, values, values, np.roll(resets, -1), resets, resets, 0)
     scores = [score_take(name, q, truth, humanoid, contact, n) for q, n in ((estimate, 1), (regressed, 0), (truth, 0))]
-    return FragmentResult(Piece(take, 0, FRAMES), made[0], found, made[1], made[2], *scores)
+    judged = take_triggers(found, {11: 7}, 30)
+    return FragmentResult(Piece(take, 0, FRAMES), made[0], found, made[1], made[2], *scores, judged)
 
 
 def test_the_page_says_what_the_results_say(evaluation: Path, humanoid: HumanoidModel, tmp_path: Path) -> None:
@@ -158,12 +162,15 @@ def test_the_page_says_what_the_results_say(evaluation: Path, humanoid: Humanoid
             assert (float(cell) == expected["value"]) if expected else cell == "-", (metric.key, name)
         assert float(row[4]) == results["reference"][metric.key] if row[4] != "-" else True
     assert [float(c) for c in rows[-1][1:3]] == [1.0 * results["resets"]["ours"], 0.0]
+    # The fail-safe's triggers: a row a run, then one a trigger of the first run.
+    assert [row[2:4] for row in found.tables[2][1:]] == [["2", "2"]] * 2
+    assert [row[3] for row in found.tables[3][1:]] == ["7"] * 2
     text = out.read_text()
     assert "python -m egopose.evaluate &#x27;checkpoint=[a,b]&#x27; report=true" in text
     assert "rendered from real motion capture" in text
     assert "Content-Security-Policy" in text
     # One table of joints: its mean over joints and takes is the figure of the first run.
-    joints = np.array([[float(c) for c in row[1:]] for row in found.tables[3][1:]])
+    joints = np.array([[float(c) for c in row[1:]] for row in found.tables[5][1:]])
     key = "mpjpe_root_aligned"
     for column, name in enumerate(("ours", "PoseReg")):
         assert joints[:, column].mean() == pytest.approx(np.mean(results["per_take"][name][key][0]), rel=1e-9)

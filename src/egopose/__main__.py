@@ -13,6 +13,7 @@ VERBS = {
     "train": "train a policy (Hydra: group=choice key=value, --multirun)",
     "baseline": "train a method that policies are compared with: ERD, acLSTM, PathPose",
     "evaluate": "score a checkpoint on held-out takes beside PoseReg: tables, CSV, BVH, side-by-side MP4",
+    "kappa": "choose the fail-safe's threshold for a run on its training takes",
     "estimate": "motion from a video alone: BVH and MP4",
     "export": "motions for other programs: BVH, GLB, AMASS npz, TRC, C3D, OpenSim, CSV",
     "view": "look at motions, estimates and forecasts in the browser",

@@ -188,7 +188,8 @@ def run_estimate(config: Mapping[str, Any], agent: Agent, pose_motion: Motion, v
     from egopose.inference.failsafe import FailSafe, FailSafeSettings
     from egopose.vision.lens import Camera
 
-    guard = FailSafe(1, from_mapping(FailSafeSettings, config["failsafe"], "conf/estimate.yaml: failsafe"))
+    failsafe = from_mapping(FailSafeSettings, config["failsafe"], "conf/estimate.yaml: failsafe")
+    guard = FailSafe(1, failsafe.for_run(agent.config))
     torch.set_num_threads(1)
     env = agent.make_env("test", worlds=1, threads=1, whole_fragments=True, falls_end=False)
     lookahead = allowed_lookahead(config)

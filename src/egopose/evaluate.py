@@ -32,6 +32,7 @@ class Results:
         folder: of all files, see docs/howto-evaluate.md.
         comparison: the table.
         survival: frames survived per run, see :func:`egopose.evaluation.agents.survival_figures`.
+        failsafe: of each run, see :func:`egopose.evaluation.agents.failsafe_figures`.
         videos: the side-by-side MP4s.
         rendered: whether any take's wearer's video is rendered and not filmed.
     """
@@ -39,6 +40,7 @@ class Results:
     folder: Path
     comparison: Comparison
     survival: list[dict[str, dict[str, float]]]
+    failsafe: list[dict[str, Any]]
     videos: list[Path]
     rendered: bool
 
@@ -65,7 +67,7 @@ def run_evaluation(
     import torch
 
     from egopose.evaluation import report
-    from egopose.evaluation.agents import evaluate_agent, survival_figures
+    from egopose.evaluation.agents import evaluate_agent, failsafe_figures, survival_figures
     from egopose.evaluation.protocols import ContactSettings
     from egopose.inference.failsafe import FailSafeSettings
     from egopose.pipeline import build_networks
@@ -81,7 +83,10 @@ def run_evaluation(
         raise InputError(source, "split", f"the data has no {split} fragments")
     labels = [f"{names[f.take]}_{f.start}-{f.stop}" for f in fragments]
 
-    runs = [evaluate_agent(agent, fragments, labels, split, failsafe, contact, threads) for agent in agents]
+    window = int(config["failsafe_report"]["window"])
+    runs = [evaluate_agent(agent, fragments, labels, split, failsafe, contact, threads, window) for agent in agents]
+    guards = [failsafe.for_run(agent.config) for agent in agents]
+    guarded = [failsafe_figures(run, guard, window) for run, guard in zip(runs, guards, strict=True)]
     interval, survive = config["interval"], config["survival"]
     comparison = report.compare_runs(runs, float(interval["level"]), int(interval["draws"]), int(interval["seed"]))
     survival = []
@@ -101,6 +106,7 @@ def run_evaluation(
         "rendered_video": rendered,
         "settings": {key: config[key] for key in ("failsafe", "contact", "interval", "survival")},
         "survival": survival,
+        "failsafe": guarded,
     }
     report.write_results(out, comparison, runs, about)
 
@@ -117,18 +123,19 @@ def run_evaluation(
         motions = {"reference": result.reference, "estimate": result.motion}
         report.write_side_by_side(path, material.humanoid, motions, video, fragment.start, int(config["video"]["size"]))
         written.append(path)
-    return Results(out, comparison, survival, written, rendered)
+    return Results(out, comparison, survival, guarded, written, rendered)
 
 
 def summary(results: Results) -> str:
     """What the terminal shows at the end."""
-    from egopose.evaluation import tables
+    from egopose.evaluation import tables, triggers
     from egopose.evaluation.report import HEADLINE, RENDERED_NOTE
 
     lines = [tables.as_text(results.comparison, HEADLINE)]
     for run, figures in enumerate(results.survival):
         parts = ", ".join(f"{name.replace('_', ' ')} {found['frames']:.1f}" for name, found in figures.items())
         lines.append(f"frames survived (run {run}): {parts}")
+    lines += [f"fail-safe (run {run}): {triggers.as_text(found)}" for run, found in enumerate(results.failsafe)]
     lines += [f"video: {path}" for path in results.videos]
     lines += [RENDERED_NOTE] if results.rendered else []
     return "\n".join([*lines, f"all results: {results.folder}"])

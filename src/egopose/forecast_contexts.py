@@ -92,7 +92,7 @@ def _estimated(
     material = context_material(agent.material, first, context, seen)
     policy = load_agent(checkpoint, material)
     env = policy.make_env(worlds=len(first), threads=threads, whole_fragments=True, falls_end=False)
-    guard = FailSafe(len(first), failsafe)
+    guard = FailSafe(len(first), failsafe.for_run(policy.config))
     estimates = estimate_takes(env, policy.actor, policy.critic, policy.followed_states(), guard)
     env.close()
     clips = seen["humanoid_state"].double().unflatten(0, (len(first), context))

@@ -113,7 +113,7 @@ def build_loop(values: Mapping[str, Any], trained: Trained, source: SourceSettin
             raise InputError(_CONFIG, name, f"must be a whole number of at least {least}, not {values[name]!r}")
     torch.set_num_threads(values["threads"])
     cv2.setNumThreads(values["opencv_threads"])
-    failsafe = from_mapping(FailSafeSettings, values["failsafe"], f"{_CONFIG}: failsafe")
+    failsafe = from_mapping(FailSafeSettings, values["failsafe"], f"{_CONFIG}: failsafe").for_run(trained.config)
     limits = {name: values[name] for name in ("seconds", "bridge")}
     settings = from_mapping(LoopSettings, limits, _CONFIG)
     flow = FlowConfig(**dict(trained.made_with["vision"]["flow"]))

@@ -4,16 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import torch
+from torchrl.envs import TransformedEnv
 
 from egopose.envs.starts import FragmentLike
 from egopose.errors import InputError
 from egopose.evaluation.protocols import ContactSettings, TakeScores, score_take
 from egopose.evaluation.survival import base_tracking, frames_survived, reference_tracking
+from egopose.evaluation.triggers import TakeTriggers, as_dict, take_triggers
 from egopose.inference.estimator import Controller, Estimate, estimate_takes
 from egopose.inference.failsafe import FailSafe, FailSafeSettings
+from egopose.inference.forks import Forks
 from egopose.models.pose_regression import pose_regression
 from egopose.motion import rotations as rot
 from egopose.motion.motion import Motion
@@ -27,7 +30,10 @@ SHORTEST = 4  # frames that every metric needs
 
 @dataclass(frozen=True)
 class FragmentResult:
-    """One fragment: what was true, what the policy and what PoseReg made of it, and the figures of all three."""
+    """One fragment: what was true, what the policy and what PoseReg made of it, and the figures of all three.
+
+    ``triggers`` are the fail-safe's, judged; None where that was not asked for.
+    """
 
     fragment: FragmentLike
     reference: Motion
@@ -37,6 +43,7 @@ class FragmentResult:
     scores: TakeScores
     pose_regression_scores: TakeScores
     reference_scores: TakeScores
+    triggers: TakeTriggers | None = None
 
 
 def evaluate_agent(
@@ -47,6 +54,7 @@ def evaluate_agent(
     failsafe: FailSafeSettings,
     contact: ContactSettings,
     threads: int,
+    window: int | None = None,
 ) -> list[FragmentResult]:
     """Estimate every fragment in one pass, all side by side, and score it beside PoseReg.
 
@@ -58,6 +66,7 @@ def evaluate_agent(
         failsafe: when the humanoid restarts.
         contact: when a sole stands.
         threads: of the physics.
+        window: frames after a trigger within which the body must have fallen without it; None to judge no triggers.
 
     Raises:
         InputError: there are no regressed states, or a fragment is shorter than 4 frames.
@@ -68,19 +77,44 @@ def evaluate_agent(
     for fragment, name in zip(fragments, names, strict=True):
         if fragment.stop - fragment.start < SHORTEST:
             raise InputError(name, "length", f"{fragment.stop - fragment.start} frames; metrics need {SHORTEST}")
-    worlds = len(fragments)
-    env = agent.make_env(split, worlds=worlds, threads=threads, whole_fragments=True, falls_end=False)
-    guard = FailSafe(worlds, failsafe)
-    estimates = estimate_takes(env, agent.actor, agent.critic, agent.followed_states(), guard)
-    env.close()
+    estimates, triggers = estimate_and_judge(agent, len(fragments), split, failsafe, threads, window)
     return [
-        _result(agent, fragment, name, estimate, contact)
-        for fragment, name, estimate in zip(fragments, names, estimates, strict=True)
+        _result(agent, fragment, name, estimate, contact, judged)
+        for fragment, name, estimate, judged in zip(fragments, names, estimates, triggers, strict=True)
     ]
 
 
+def estimate_and_judge(
+    agent: Agent, worlds: int, split: str, failsafe: FailSafeSettings, threads: int, window: int | None
+) -> tuple[list[Estimate], Sequence[TakeTriggers | None]]:
+    """Estimates of the first ``worlds`` fragments of ``split``, and the fail-safe's triggers, judged.
+
+    Other arguments as of :func:`evaluate_agent`.
+    """
+
+    def make_env(count: int) -> TransformedEnv:
+        return agent.make_env(split, worlds=count, threads=threads, whole_fragments=True, falls_end=False)
+
+    env, forks = make_env(worlds), Forks()
+    guard = FailSafe(worlds, failsafe.for_run(agent.config))
+    estimates = estimate_takes(env, agent.actor, agent.critic, agent.followed_states(), guard, forks=forks)
+    env.close()
+    if window is None:
+        return estimates, [None] * worlds
+    to_fall: list[dict[int, int | None]] = [{} for _ in estimates]
+    ahead = forks.frames_to_fall(make_env, agent.actor, window)
+    for (world, frame), frames in zip(forks.places, ahead, strict=True):
+        to_fall[world][frame - estimates[world].start] = frames
+    return estimates, [take_triggers(e, found, window) for e, found in zip(estimates, to_fall, strict=True)]
+
+
 def _result(
-    agent: Agent, fragment: FragmentLike, name: str, estimate: Estimate, contact: ContactSettings
+    agent: Agent,
+    fragment: FragmentLike,
+    name: str,
+    estimate: Estimate,
+    contact: ContactSettings,
+    triggers: TakeTriggers | None,
 ) -> FragmentResult:
     humanoid, rows = agent.material.humanoid, slice(estimate.start, estimate.start + len(estimate.qpos))
     fps = 1.0 / humanoid.control_dt
@@ -104,7 +138,16 @@ def _result(
         score_take(name, estimate.qpos, truth, humanoid, contact, estimate.n_resets),
         score_take(name, regressed.qpos, truth, humanoid, contact),
         score_take(name, truth, truth, humanoid, contact),
+        triggers,
     )
+
+
+def failsafe_figures(results: Sequence[FragmentResult], settings: FailSafeSettings, window: int) -> dict[str, Any]:
+    """A run's fail-safe for JSON: mode, kappa and window, and :func:`egopose.evaluation.triggers.as_dict` of it all."""
+    judged = [(one.motion.name, one.triggers) for one in results if one.triggers is not None]
+    names, takes = [name for name, _ in judged], [found for _, found in judged]
+    about = {"mode": settings.mode, "kappa": settings.kappa, "window_frames": window}
+    return about | as_dict(names, takes, results[0].motion.fps)
 
 
 def survival_figures(

@@ -83,6 +83,7 @@ def write_report(folder: Path, humanoid: HumanoidModel | None, settings: ReportS
             ("What was evaluated", _about(results)),
             ("Figures", figures_table(results)),
             ("Frames survived", _survival(results)),
+            ("Fail-safe", _failsafe(results)),
             ("Takes", _takes_table(results)),
             ("Error over time", _over_time(takes, settings)),
             ("Error by joint", _by_joint(takes)),
@@ -157,6 +158,39 @@ def _survival(results: Mapping[str, Any]) -> str:
         for name, f in found.items()
     ]
     return page.table(["run", "controller", "frames until a fall", "share that fell"], rows)
+
+
+def _failsafe(results: Mapping[str, Any]) -> str:
+    keys = ("triggers", "foreseen", "late", "false_alarm", "cut_short", "missed", "median_lead_frames", "kappa")
+    runs = results.get("failsafe", [])
+    header = ["run", "mode", *(key.replace("_", " ") for key in keys), "fallen (% of frames)"]
+    rows = [
+        [
+            page.text(run),
+            page.text(found["mode"]),
+            *(page.number(found[key], 3 if key == "kappa" else 0) for key in keys),
+            page.number(100 * found["fallen_share"], 1),
+        ]
+        for run, found in enumerate(runs)
+    ]
+    if not rows:
+        return '<p class="note">Not judged: evaluate anew, older evaluations did not.</p>'
+    each = [
+        [
+            page.text(take["take"]),
+            page.text(t["frame"]),
+            page.text(t["kind"].replace("_", " ")),
+            page.number(t["lead_frames"], 0),
+        ]
+        for take in runs[0]["takes"]
+        for t in take["triggers"]
+    ]
+    note = (
+        f'<p class="note">A trigger is right where the body would have fallen within {runs[0]["window_frames"]} frames '
+        "without the reset, which was simulated from the very state of the trigger. Lead: frames from the trigger to "
+        "that fall; negative where the body had fallen already.</p>"
+    )
+    return page.table(header, rows) + note + (page.table(["take", "frame", "kind", "lead"], each) if each else "")
 
 
 def _takes_table(results: Mapping[str, Any]) -> str:

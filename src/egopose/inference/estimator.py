@@ -22,6 +22,7 @@ from egopose.envs.env import EgoPoseEnv
 from egopose.envs.transforms import StateNormalizer
 from egopose.humanoid.model import HumanoidModel
 from egopose.inference.failsafe import FailSafe
+from egopose.inference.forks import Forks
 from egopose.models.episode_context import EpisodeContext
 from egopose.models.pose_regression import state_to_qpos
 from egopose.motion import rotations as rot
@@ -41,6 +42,7 @@ class Estimate:
         qpos: ``[T, nq]``.
         value: ``[T]`` V(s_t).
         confidence: ``[T]`` V(s_t) over its running mean, see :class:`~egopose.inference.failsafe.FailSafe`.
+        triggered: ``[T]`` frames at which the fail-safe triggered.
         resets: ``[T]`` frames whose state is the regressor's because the fail-safe triggered or the physics broke just
             before. The first frame is not counted.
         fallen: ``[T]`` frames in which the head is too low for the take.
@@ -51,6 +53,7 @@ class Estimate:
     qpos: Array
     value: Array
     confidence: Array
+    triggered: NDArray[np.bool_]
     resets: NDArray[np.bool_]
     fallen: NDArray[np.bool_]
     diverged: int
@@ -65,14 +68,20 @@ class Estimate:
         return {
             "value": self.value,
             "confidence": self.confidence,
+            "triggered": self.triggered.astype(np.float64),
             "reset": self.resets.astype(np.float64),
             "fallen": self.fallen.astype(np.float64),
         }
 
     def motion(self, humanoid: HumanoidModel, name: str) -> Motion:
-        """The estimate as a :class:`Motion` of the humanoid's skeleton."""
+        """The estimate as a :class:`Motion` of the humanoid's skeleton, with its confidence."""
         return Motion(
-            humanoid.skeleton, self.qpos, 1.0 / humanoid.control_dt, name, meta={"source": "estimated by egopose"}
+            humanoid.skeleton,
+            self.qpos,
+            1.0 / humanoid.control_dt,
+            name,
+            confidence=self.confidence,
+            meta={"source": "estimated by egopose"},
         )
 
 
@@ -84,6 +93,7 @@ def estimate_takes(
     states: Tensor,
     guard: FailSafe,
     lookahead: int | None = None,
+    forks: Forks | None = None,
 ) -> list[Estimate]:
     """Run every world's fragment from its first frame to its last.
 
@@ -97,6 +107,7 @@ def estimate_takes(
         guard: the fail-safe, of as many worlds.
         lookahead: future frames that trainable contexts may see; None for the whole take. ``states`` and contexts that
             come with the observation are the caller's.
+        forks: is told the states in which the fail-safe triggered.
 
     Returns:
         One :class:`Estimate` a world; fragments may differ in length.
@@ -111,7 +122,9 @@ def estimate_takes(
     _restart(base, worlds, states[start], base.body_state()["qpos"])
     observation = env.transform(base.observe())
 
-    rows: dict[str, list[Tensor]] = {name: [] for name in ("qpos", "value", "resets", "fallen", "diverged")}
+    rows: dict[str, list[Tensor]] = {
+        name: [] for name in ("qpos", "value", "triggered", "resets", "fallen", "diverged")
+    }
     placed, diverged = torch.zeros_like(worlds, dtype=torch.bool), torch.zeros_like(worlds, dtype=torch.bool)
     with set_exploration_type(ExplorationType.DETERMINISTIC):
         for t in range(int(lengths.max())):
@@ -119,9 +132,11 @@ def estimate_takes(
             observation = critic(actor(observation))
             value = observation["state_value"].squeeze(-1)
             triggered = guard.update(value, body["xpos"][:, base.problem.humanoid.head, 2], t < lengths)
-            frame = (body["qpos"], value, placed, observation["fallen"].squeeze(-1), diverged)
+            frame = (body["qpos"], value, triggered, placed, observation["fallen"].squeeze(-1), diverged)
             for name, column in zip(rows, frame, strict=True):
                 rows[name].append(column)
+            if forks is not None and triggered.any():
+                forks.keep(base, observation, triggered.nonzero().squeeze(-1))
             if t + 1 == int(lengths.max()):
                 break
             after = env.step(observation)["next"]
@@ -140,6 +155,7 @@ def estimate_takes(
             qpos=table["qpos"][i, :n],
             value=table["value"][i, :n].astype(np.float64),
             confidence=confidence[i, :n],
+            triggered=table["triggered"][i, :n],
             resets=table["resets"][i, :n],
             fallen=table["fallen"][i, :n],
             diverged=int(table["diverged"][i, :n].sum()),

@@ -6,7 +6,10 @@ Three modes. ``value``: reset when ``V(s_t) < kappa * V_mean``, V_mean the runni
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -14,6 +17,8 @@ from torch import Tensor
 from egopose.errors import InputError
 
 MODES = ("value", "naive", "off")
+#: Yuan & Kitani 2019, sections 3.3 and 4: kappa, and the discount their values have.
+PAPER_KAPPA, PAPER_DISCOUNT = 0.6, 0.95
 
 
 @dataclass(frozen=True)
@@ -22,7 +27,8 @@ class FailSafeSettings:
 
     Args:
         mode: one of ``value``, ``naive``, ``off``.
-        kappa: fraction of the mean value under which the state counts as unstable.
+        kappa: fraction of the mean value under which the state counts as unstable; None for :func:`paper_kappa` of the
+            discount the values were learned with, see :meth:`for_run`.
         fallen_height: head height (m) under which the humanoid counts as fallen, for ``naive``.
 
     Raises:
@@ -30,12 +36,31 @@ class FailSafeSettings:
     """
 
     mode: str
-    kappa: float
+    kappa: float | None
     fallen_height: float
 
     def __post_init__(self) -> None:
         if self.mode not in MODES:
             raise InputError("failsafe", "mode", f"must be one of {', '.join(MODES)}, not {self.mode!r}")
+
+    def for_run(self, config: Mapping[str, Any]) -> FailSafeSettings:
+        """With ``kappa`` as it stands, or where there is none the paper's at the discount of a run's ``config``."""
+        return self if self.kappa is not None else replace(self, kappa=paper_kappa(float(config["algo"]["gamma"])))
+
+
+def paper_kappa(discount: float) -> float:
+    """The paper's kappa of .6, which belongs to its discount of .95, for values of another discount.
+
+    At an even reward r, a state whose episode ends in n frames is worth ``r (1 - discount^n) / (1 - discount)``, one
+    that goes on for ever ``r / (1 - discount)``: kappa times the latter is reached n frames before the end, where
+    ``kappa = 1 - discount^n``. What is kept is n, 17.9 frames; at .99 kappa becomes .164.
+
+    Raises:
+        InputError: a discount that is not between 0 and 1.
+    """
+    if not 0.0 < discount < 1.0:
+        raise InputError("algo", "gamma", f"must lie between 0 and 1 for the fail-safe's kappa, not {discount}")
+    return 1.0 - (1.0 - PAPER_KAPPA) ** (math.log(discount) / math.log(PAPER_DISCOUNT))
 
 
 class FailSafe:
@@ -43,7 +68,10 @@ class FailSafe:
 
     Args:
         worlds: N.
-        settings: see :class:`FailSafeSettings`.
+        settings: see :class:`FailSafeSettings`; with a kappa.
+
+    Raises:
+        ValueError: there is no kappa.
 
     Attributes:
         confidence: list over calls of ``[N]`` float64: V(s_t) over its running mean (1 at the first frame; NaN for
@@ -51,7 +79,9 @@ class FailSafe:
     """
 
     def __init__(self, worlds: int, settings: FailSafeSettings) -> None:
-        self.settings = settings
+        if settings.kappa is None:
+            raise ValueError("kappa is not known: take settings.for_run(...)")
+        self.settings, self._kappa = settings, settings.kappa
         self.confidence: list[Tensor] = []
         self._sum = torch.zeros(worlds, dtype=torch.float64)
         self._count = torch.zeros(worlds, dtype=torch.float64)
@@ -81,7 +111,7 @@ class FailSafe:
 
     def _unstable(self, ratio: Tensor, head_height: Tensor) -> Tensor:
         if self.settings.mode == "value":
-            return ratio < self.settings.kappa
+            return ratio < self._kappa
         if self.settings.mode == "naive":
             return head_height < self.settings.fallen_height
         return torch.zeros_like(ratio, dtype=torch.bool)

@@ -27,6 +27,7 @@ class Motion:
         contacts: ``[T, k]`` booleans per contact point, or None; ``contact_names`` says which.
         torques: ``[T, nv - 6]`` N m per hinge, or None.
         ground_reaction: forces of the ground, or None.
+        confidence: ``[T]`` how sure an estimate is of each frame, 1 being as sure as usual, or None.
         meta: where it comes from (JSON-like values only): source, units, up axis, licence.
 
     Raises:
@@ -41,6 +42,7 @@ class Motion:
     contact_names: tuple[str, ...] = ()
     torques: Array | None = None
     ground_reaction: GroundReaction | None = None
+    confidence: Array | None = None
     meta: dict[str, Any] = field(default_factory=dict, compare=False)
 
     def __post_init__(self) -> None:
@@ -54,7 +56,7 @@ class Motion:
             raise ValueError(f"qpos is not finite at frame {int(np.argwhere(~np.isfinite(qpos))[0, 0])}")
         if not self.fps > 0:
             raise ValueError(f"fps must be positive, got {self.fps}")
-        for label in ("contacts", "torques", "ground_reaction"):
+        for label in ("contacts", "torques", "ground_reaction", "confidence"):
             extra = getattr(self, label)
             if extra is not None and len(extra) != len(qpos):
                 raise ValueError(f"{label} have {len(extra)} frames, qpos has {len(qpos)}")
@@ -84,12 +86,14 @@ class Motion:
             contacts=None if self.contacts is None else self.contacts[part],
             torques=None if self.torques is None else self.torques[part],
             ground_reaction=None if self.ground_reaction is None else self.ground_reaction.at(part),
+            confidence=None if self.confidence is None else self.confidence[part],
         )
 
     def resample(self, fps: float) -> Motion:
         """The same motion at another rate, from the first frame on: slerp for the root, linear for the rest.
 
-        Contacts and forces of the ground take the nearest frame. The last sample is the last that lies inside the clip.
+        Contacts, confidence and forces of the ground take the nearest frame. The last sample is the last that lies
+        inside the clip.
         """
         if abs(fps - self.fps) < 1e-9 or len(self) == 1:
             return replace(self, fps=fps)
@@ -113,6 +117,7 @@ class Motion:
             contacts=None if self.contacts is None else self.contacts[nearest],
             torques=None if self.torques is None else (1 - weight) * self.torques[low] + weight * self.torques[low + 1],
             ground_reaction=None if self.ground_reaction is None else self.ground_reaction.at(nearest),
+            confidence=None if self.confidence is None else self.confidence[nearest],
         )
 
 

@@ -16,7 +16,7 @@ from egopose.motion.rotations import Array
 
 
 def write_csv(motion: Motion, path: str | Path, *, up: str = "z") -> None:
-    """Write coordinates, joint positions, contacts, torques and forces of the ground.
+    """Write coordinates, joint positions, contacts, torques, forces of the ground and an estimate's confidence.
 
     The lines before the header begin with ``#`` (``pandas.read_csv(path, comment="#")``): name, frame rate, axes and
     the skeleton as JSON (offsets in m, each joint's degrees of freedom with their axes), which makes the table whole.
@@ -52,6 +52,8 @@ def write_csv(motion: Motion, path: str | Path, *, up: str = "z") -> None:
             columns |= _named(f"{body} ground force {{}} [N]", "xyz", ground.force[:, k])
             columns |= _named(f"{body} ground point {{}} [m]", "xyz", ground.point[:, k])
             columns |= _named(f"{body} ground moment {{}} [N m]", "xyz", ground.moment[:, k])
+    if motion.confidence is not None:
+        columns["confidence"] = motion.confidence
     head = [
         f"# name: {' '.join(motion.name.split())}",
         f"# fps: {motion.fps!r}",

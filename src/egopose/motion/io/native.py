@@ -34,7 +34,7 @@ def write_native(motion: Motion, path: str | Path, *, dtype: str = "float64") ->
 
     Arrays: ``header`` (UTF-8 JSON as uint8: format, version, name, fps, skeleton, contact names, names of the bodies
     on the ground, meta), ``qpos [T, nq]``, and ``contacts [T, k]``, ``torques [T, nv - 6]``, ``ground_force``,
-    ``ground_point``, ``ground_moment [T, b, 3]`` where the motion has them.
+    ``ground_point``, ``ground_moment [T, b, 3]``, ``confidence [T]`` where the motion has them.
 
     Raises:
         ValueError: another ``dtype``, or ``meta`` that JSON cannot say.
@@ -60,6 +60,8 @@ def write_native(motion: Motion, path: str | Path, *, dtype: str = "float64") ->
         arrays["contacts"] = np.asarray(motion.contacts, dtype=bool)
     if motion.torques is not None:
         arrays["torques"] = np.asarray(motion.torques, dtype=dtype)
+    if motion.confidence is not None:
+        arrays["confidence"] = np.asarray(motion.confidence, dtype=dtype)
     if motion.ground_reaction is not None:
         for label in _GROUND:
             arrays[f"ground_{label}"] = getattr(motion.ground_reaction, label).astype(dtype)
@@ -74,7 +76,8 @@ def read_native(path: str | Path) -> Motion:
         InputError: names the file, the field of the header or the array, and the cause.
     """
     path = Path(path)
-    arrays = read_arrays(path, ("header", "qpos", "contacts", "torques", *(f"ground_{label}" for label in _GROUND)))
+    ground = tuple(f"ground_{label}" for label in _GROUND)
+    arrays = read_arrays(path, ("header", "qpos", "contacts", "torques", "confidence", *ground))
     if "header" not in arrays or arrays["header"].dtype != np.uint8 or arrays["header"].ndim != 1:
         raise InputError(path, "header", "missing or not bytes: not a clip of this project")
     if len(arrays["header"]) > _MAX_HEADER:
@@ -90,7 +93,7 @@ def read_native(path: str | Path) -> Motion:
     qpos = arrays.get("qpos")
     if qpos is None or qpos.dtype not in (np.float32, np.float64):
         raise InputError(path, "qpos", "missing or not float32 or float64")
-    expected = {"contacts": ("b", 2), "torques": ("f", 2), **{f"ground_{label}": ("f", 3) for label in _GROUND}}
+    expected = {"contacts": ("b", 2), "torques": ("f", 2), "confidence": ("f", 1), **dict.fromkeys(ground, ("f", 3))}
     for label, (kind, axes) in expected.items():
         if label in arrays and (arrays[label].dtype.kind != kind or arrays[label].ndim != axes):
             raise InputError(path, label, f"wrong type or shape: {arrays[label].dtype} {arrays[label].shape}")
@@ -99,7 +102,7 @@ def read_native(path: str | Path) -> Motion:
         raise InputError(
             path, "torques", f"{arrays['torques'].shape[1]} columns for {skeleton.n_dofs} degrees of freedom"
         )
-    for label in sorted({"qpos", "torques", *(f"ground_{label}" for label in _GROUND)} & set(arrays)):
+    for label in sorted({"qpos", "torques", "confidence", *ground} & set(arrays)):
         bad = ~(np.abs(arrays[label]) < _MAX_VALUE).reshape(len(arrays[label]), -1).all(axis=1)
         if bad.any():
             raise InputError(path, label, f"frame {int(np.argmax(bad))} is not finite or absurdly large")
@@ -111,7 +114,7 @@ def read_native(path: str | Path) -> Motion:
     meta = header.get("meta", {})
     if not isinstance(meta, dict):
         raise InputError(path, "header.meta", "is not an object")
-    torques = arrays.get("torques")
+    torques, confidence = arrays.get("torques"), arrays.get("confidence")
     return _checked(
         path,
         "qpos",
@@ -124,6 +127,7 @@ def read_native(path: str | Path) -> Motion:
             contact_names=tuple(str(n) for n in header["contact_names"]),
             torques=None if torques is None else torques.astype(np.float64),
             ground_reaction=_ground_reaction(arrays, header),
+            confidence=None if confidence is None else confidence.astype(np.float64),
             meta=meta,
         ),
     )
