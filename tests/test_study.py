@@ -120,11 +120,12 @@ def test_done_jobs_are_skipped_and_an_interrupted_study_goes_on(tmp_path: Path) 
 
 def raw(folder: Path, method: str, fold: str, seed: int, figures: dict[str, Any], **more: Any) -> None:
     takes = [f"{fold}{k}" for k in range(len(next(iter(figures.values()))))]
-    table = "table3_horizons" if "horizons" in more else "table1_estimation"
+    forecasts = "horizons" in more
+    table, protocol = ("table3_horizons", "forecast_single") if forecasts else ("table1_estimation", "single")
     path = folder / table / "raw" / f"{method}-{fold}-{seed}.json"
     path.parent.mkdir(parents=True, exist_ok=True)
     result = {
-        **{"method": method, "protocol": "single", "fold": fold, "seed": seed, "takes": takes, "figures": figures},
+        **{"method": method, "protocol": protocol, "fold": fold, "seed": seed, "takes": takes, "figures": figures},
         **{"overrides": ["training.total_steps=100"], "resets": [0] * len(takes), "frames": [900] * len(takes)},
     }
     path.write_text(json.dumps({**result, **more}))

@@ -25,11 +25,11 @@ from egopose.forecast_contexts import past_states
 from egopose.forecast_evaluation import ForecastSettings, forecast_windows_of, windows_of
 from egopose.inference.context_states import context_states
 from egopose.inference.failsafe import FailSafeSettings
-from egopose.inference.forecaster import placed_states
 from egopose.material import Material, absolute_paths, load_material, run_material
 from egopose.models.baselines.path_pose import PathPose
 from egopose.models.baselines.recurrent import RecurrentForecaster
 from egopose.motion.rotations import Array
+from egopose.motion_forecasts import begin_forecasts
 from egopose.pipeline import load_agent
 from egopose.regression import load_regressor
 from egopose.train import run_job as train_job
@@ -160,9 +160,7 @@ def _forecasts(
         windows = windows_of(agent, "test", forecast)
         # As the baselines: what the run's own state regressor sees in the contexts alone.
         pasts = past_states(agent, windows, "regressor")
-        now = torch.tensor([int(material.takes.offsets[w.take]) + w.now for w in windows])
-        where = torch.as_tensor(material.reference["qpos"][now]).double().numpy()
-        states = placed_states(pasts[:, -1].numpy(), where, material.humanoid.joint_range)
+        states = begin_forecasts(agent, windows, pasts)
         futures = forecast_windows_of(agent, windows, states, 1, forecast, int(settings["threads"])).qpos
     else:
         material = _material(folder, config, judged)

@@ -27,6 +27,8 @@ from egopose.untrusted import read_json
 
 HERE = Path(__file__).resolve().parent
 ESTIMATION, ABLATIONS, HORIZONS = "table1_estimation", "table2_ablations", "table3_horizons"
+#: Names in ratios.json, and the study's folds: windows of four seconds need longer test parts than estimation does.
+FORECASTS = {"forecast": "forecast_single", "forecast_cross": "forecast_cross"}
 OURS = {"estimation": "ours", "forecasting": "ours_forecast"}
 LABELS = {
     "ours": "ours",
@@ -169,7 +171,7 @@ def ratios(found: Mapping[tuple[str, str], Scores]) -> dict[str, dict[str, Any]]
     for name, paper in PAPER.items():
         part, metric = name.split("/")
         task = "forecasting" if part.startswith("forecast") else "estimation"
-        protocol = {"forecast": "single", "forecast_cross": "cross"}.get(part, part)
+        protocol = FORECASTS.get(part, part)
         ours = found.get((protocol, OURS[task]))
         for baseline in paper:
             other = found.get((protocol, baseline))
@@ -246,14 +248,14 @@ def ablation_table(found: Mapping[tuple[str, str], Scores]) -> list[str]:
 def horizon_table(found: Mapping[tuple[str, str], Scores], measured: Mapping[str, Mapping[str, Any]]) -> list[str]:
     """Table 3 and Table 1's half of forecasting, as Markdown."""
     lines: list[str] = []
-    for protocol, prefix in (("single", "forecast"), ("cross", "forecast_cross")):
+    for prefix, protocol in FORECASTS.items():
         methods = [m for m in PAPER_HORIZONS if (protocol, m) in found]
         if not methods:
             continue
         first = next(iter(next(iter(found[protocol, methods[0]].results.values())).values()))
         times = [float(h) for h in first["horizons"]]
         heads = [f"E_pose {h:.2g} s" for h in times]
-        title = "Single subject" if protocol == "single" else "Cross subject"
+        title = "Single subject" if prefix == "forecast" else "Cross subject"
         lines += [f"## {title}", "", *_header(["method", *heads, "E_vel 3 s", "A_accl 3 s"])]
         for method in methods:
             scores = found[protocol, method]
@@ -262,7 +264,7 @@ def horizon_table(found: Mapping[tuple[str, str], Scores], measured: Mapping[str
             cells = [_cell(_interval(scores, "E_pose", folds, seeds, h)) for h in times]
             cells += [_cell(_interval(scores, key, folds, seeds, 3.0)) for key in ("E_vel", "A_accl")]
             lines.append(_row([LABELS[method], *cells]))
-            if protocol == "cross":
+            if prefix == "forecast_cross":
                 lines.append(_row(["the paper's", *(f"{v:.3f}" for v in PAPER_HORIZONS[method]), "", ""]))
         lines += ["", *_ratio_rows([name for name in PAPER if name.startswith(f"{prefix}/")], measured), ""]
     return lines

@@ -25,12 +25,13 @@ from egopose.evaluation.report import RENDERED_NOTE, TakeVideo, file_name, write
 from egopose.forecast_contexts import SOURCES, past_states
 from egopose.inference.bands import Bands, fit_scale, quantile_bands
 from egopose.inference.failsafe import FailSafeSettings
-from egopose.inference.forecaster import Forecasts, forecast, placed_states
+from egopose.inference.forecaster import Forecasts, forecast
 from egopose.material import Material
 from egopose.models.baselines.recurrent import RecurrentForecaster
 from egopose.motion.io import write_motion
 from egopose.motion.motion import Motion
 from egopose.motion.rotations import Array
+from egopose.motion_forecasts import begin_forecasts
 
 if TYPE_CHECKING:
     from egopose.pipeline import Agent
@@ -116,7 +117,7 @@ def run_forecast_evaluation(
             told = _baseline_futures(agent, windows, pasts, str(run))
             methods[name] = [score_forecasts(truth, windows, told, hands, fps)]
             others[name] = told[:, 0]
-        states = _starts(agent, windows, pasts)
+        states = begin_forecasts(agent, windows, pasts)
         mean = forecast_windows_of(agent, windows, states, 1, settings, int(config["threads"]))
         methods[OURS].append(score_forecasts(truth, windows, mean.qpos, hands, fps))
         still = states[0].numpy()[:, None, None].repeat(windows[0].horizon, axis=2)
@@ -192,14 +193,6 @@ def _pasts(
     return torch.cat([past_states(agent, p, settings.start, settings.estimator, failsafe, threads) for p in parts])
 
 
-def _starts(agent: Agent, windows: Sequence[ForecastWindow], pasts: Tensor) -> tuple[Tensor, Tensor]:
-    """The last states of ``pasts [W, context, S]`` where the reference stands and faces: qpos and qvel."""
-    material = agent.material
-    now = torch.tensor([int(material.takes.offsets[w.take]) + w.now for w in windows])
-    where = torch.as_tensor(material.reference["qpos"][now]).double().numpy()
-    return placed_states(pasts[:, -1].numpy(), where, np.asarray(material.humanoid.joint_range))
-
-
 def _baseline_futures(agent: Agent, windows: Sequence[ForecastWindow], pasts: Tensor, run: str) -> Array:
     """``[W, 1, H, nq]`` of a trained recurrent baseline that has seen ``pasts [W, context, S]``.
 
@@ -255,7 +248,7 @@ def _bands(
     used = [7 + d for d in range(drawn.shape[-1] - 7) if d not in hands]
     bands = quantile_bands(drawn[..., used], settings.level)
     kept = windows_of(agent, "train", settings)
-    states = _starts(agent, kept, _pasts(config, agent, kept, settings))
+    states = begin_forecasts(agent, kept, _pasts(config, agent, kept, settings))
     futures = forecast_windows_of(agent, kept, states, settings.samples, settings, int(config["threads"]))
     known = quantile_bands(futures.qpos[..., used], settings.level)
     known_truth = _truth(agent.material, kept)[..., used]

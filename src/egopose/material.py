@@ -18,6 +18,7 @@ from torch import Tensor
 from egopose.data.preparation import fingerprint_of, flow_name, humanoid_of, prepare
 from egopose.data.splits import split_takes
 from egopose.data.store import TakeInfo, TakeStore
+from egopose.envs.futures import Futures
 from egopose.envs.mdp.observations import humanoid_state
 from egopose.envs.problem import TakeTable
 from egopose.envs.starts import FragmentLike
@@ -47,6 +48,7 @@ class Material:
         states: ``[F, S]`` humanoid states of the state regressor, or None.
         regressor: folder of the state regressor's weights, or None.
         store_fingerprint: of the store it all comes from, or None.
+        futures: kinematic forecasts a policy follows, or None.
     """
 
     humanoid: HumanoidModel
@@ -60,6 +62,7 @@ class Material:
     states: Tensor | None = None
     regressor: Path | None = None
     store_fingerprint: str | None = None
+    futures: Futures | None = None
 
     def keep_regressor(self, folder: Path) -> None:
         """Copy the state regressor's weights to ``folder/regressor``, so that a run can be used without its store."""

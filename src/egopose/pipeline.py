@@ -23,6 +23,7 @@ from egopose.data.preparation import store_folder
 from egopose.data.store import TakeStore
 from egopose.envs import build as envs
 from egopose.envs.forecasting import RecurrentStates, TimeLeft
+from egopose.envs.futures import FollowFuture
 from egopose.envs.mdp.observations import humanoid_state
 from egopose.envs.starts import FragmentLike
 from egopose.envs.transformed import TransformedEgoPoseEnv
@@ -33,6 +34,7 @@ from egopose.evaluation.survival import frames_survived
 from egopose.material import Material, load_material, motion_material, run_material, smoothed
 from egopose.models.policy import PolicySettings, build_actor, build_critic
 from egopose.models.recurrent import collecting_policy, hidden_keys
+from egopose.motion_forecasts import with_futures
 from egopose.runtime import settle_heap
 from egopose.training.adversarial import AdversarialPPO, DiscriminatorSettings
 from egopose.training.checkpoint import RunCheckpoint, find_checkpoint, read_json, require, verify
@@ -105,6 +107,7 @@ def build_env(
             task,
             config["reward"],
             action_reference=material.joint_targets,
+            futures=material.futures,
         )
         base = envs.build_env(
             problem,
@@ -119,11 +122,13 @@ def build_env(
     except (ValueError, TypeError) as error:
         raise error if isinstance(error, InputError) else InputError("configuration", "task", str(error)) from None
     transforms = [StateNormalizer(base.observation_spec["humanoid_state"].shape[-1])]
-    if config["model"]["context"]["source"] == "frozen":
+    if material.futures is not None:
+        transforms.insert(0, _follow(config, material))
+    elif config["model"]["context"]["source"] == "frozen":
         if material.visual_context is None:
             raise InputError("configuration", "model.context.source", "frozen needs a trained state regressor")
         transforms.insert(0, VisualContext(material.visual_context))
-    if "tracking_error" in config["model"]["inputs"]:
+    if material.futures is None and "tracking_error" in config["model"]["inputs"]:
         if material.states is None:
             raise InputError("configuration", "model.inputs", "tracking_error needs a trained state regressor")
         if "tracking_error_clip" not in task:
@@ -141,9 +146,31 @@ def build_env(
     return TransformedEgoPoseEnv(base, *transforms)
 
 
+def _follow(config: Mapping[str, Any], material: Material) -> FollowFuture:
+    """What the policy sees of the forecasts it follows, as ``task.follow`` says."""
+    assert material.futures is not None
+    task, humanoid = config["task"], material.humanoid
+    if not isinstance(task.get("follow"), Mapping):
+        raise InputError("configuration", "task.follow", "is missing: a forecaster is for task=forecasting_follow")
+    lag = torch.as_tensor(humanoid.kd / humanoid.kp) * float(task["follow"]["velocity_feedforward"])
+    return FollowFuture(
+        material.futures,
+        _scale_of(humanoid_state(material.reference).float(), material, float(config["forecaster"]["std_floor"])),
+        torch.as_tensor(humanoid.rest_action),
+        lag,
+        float(task["follow"]["error_clip"]),
+        [int(step) for step in task["follow"]["ahead"]],
+    )
+
+
 def _refuse_future(config: Mapping[str, Any]) -> None:
     """Raises InputError: a forecasting policy would read what is known only once the future was seen."""
     task, model = config["task"], config["model"]
+    if config.get("forecaster") is not None:  # these stand in the regressor's place, and know the context alone
+        if task["action"]["reference"] != "rest" or model["context"]["source"] != "frozen":
+            cause = "a forecaster is for task=forecasting_follow model=forecasting_follow"
+            raise InputError("configuration", "forecaster", cause)
+        return
     if task["action"]["reference"] == "regressor":
         raise InputError("configuration", "task.action.reference", "regressor knows the frames to be forecast")
     if "tracking_error" in model["inputs"]:
@@ -157,8 +184,12 @@ def _refuse_future(config: Mapping[str, Any]) -> None:
 def _state_scale(material: Material, floor: float) -> torch.Tensor:
     """``[S]``: deviation of the regressor's states on the training frames, floored for still numbers."""
     assert material.states is not None
+    return _scale_of(material.states, material, floor)
+
+
+def _scale_of(states: torch.Tensor, material: Material, floor: float) -> torch.Tensor:
     offsets = material.takes.offsets
-    rows = [material.states[int(offsets[f.take]) + f.start : int(offsets[f.take]) + f.stop] for f in material.train]
+    rows = [states[int(offsets[f.take]) + f.start : int(offsets[f.take]) + f.stop] for f in material.train]
     return torch.cat(rows).std(dim=0).clamp_min(floor)
 
 
@@ -321,6 +352,7 @@ def load_agent(
     if material is None:
         same_store = _STORE_GROUPS.isdisjoint(overrides or {})
         material = run_material(config, folder.resolve().parent.parent, same_store)
+    material = with_futures(config, material, folder.resolve().parent.parent)
     env = build_env(config, material, worlds=1)
     require(metadata, folder, task=str(config["task"]["name"]), action_size=int(env.action_spec.shape[-1]))
     actor, critic = build_networks(config, material, env)

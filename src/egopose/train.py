@@ -8,6 +8,8 @@ prepare_runtime()
 
 import logging  # noqa: E402
 import sys  # noqa: E402
+from collections.abc import Iterator  # noqa: E402
+from contextlib import contextmanager  # noqa: E402
 from pathlib import Path  # noqa: E402
 from typing import TYPE_CHECKING, Any  # noqa: E402
 
@@ -21,6 +23,7 @@ from egopose.errors import InputError  # noqa: E402
 
 if TYPE_CHECKING:
     from egopose.material import Material
+    from egopose.training.loop import BackgroundEvaluation, Evaluation, Run
 
 register_resolvers()
 
@@ -45,6 +48,7 @@ def run_training(
         SystemExit: 130 after Ctrl-C, so that a sweep stops as well.
     """
     from egopose import pipeline
+    from egopose.motion_forecasts import with_futures
     from egopose.training.logging import build_loggers, write_provenance
     from egopose.training.loop import train
     from egopose.training.resume import FINISHED, mark_finished
@@ -56,13 +60,15 @@ def run_training(
         print(f"run directory: {folder}", flush=True)
         if material is None:
             material = pipeline.load_material(config) if checkpoint is None else pipeline.run_material(config, folder)
+        material = with_futures(config, material, folder)
         run = pipeline.build_run(config, folder, material)
         try:
             if checkpoint is not None:
                 run.restore(checkpoint)
                 print(f"resuming {folder} after iteration {run.counters.iteration}", flush=True)
             loggers = build_loggers(config["logger"], folder, config, run.counters.iteration, run.counters.frames)
-            outcome = train(run, loggers, pipeline.build_evaluation(run, material))
+            with _evaluation(run, material) as evaluation:
+                outcome = train(run, loggers, evaluation)
         finally:
             run.collector.shutdown()
     except KeyboardInterrupt:
@@ -75,6 +81,23 @@ def run_training(
     figures = {"reason": outcome.reason, "iteration": outcome.iteration, "score": run.counters.score}
     mark_finished(folder, config, figures)
     return run.counters.score
+
+
+@contextmanager
+def _evaluation(run: Run, material: Material) -> Iterator[Evaluation | BackgroundEvaluation]:
+    """As ``training.evaluate_async`` says: between iterations, or beside them."""
+    from egopose.evaluators import BackgroundSurvival
+    from egopose.pipeline import build_evaluation
+
+    backend = run.config["training"].get("evaluate_async")
+    if backend is None or not run.settings.evaluate_every:
+        yield build_evaluation(run, material)
+        return
+    background = BackgroundSurvival(run, material, str(backend))
+    try:
+        yield background
+    finally:
+        background.close()
 
 
 def run_job(config: dict[str, Any], folder: Path, material: Material | None = None) -> float:

@@ -10,6 +10,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from egopose.envs.env import EgoPoseEnv
+from egopose.envs.futures import Futures
 from egopose.envs.mdp.rewards import build_reward
 from egopose.envs.problem import ActionSettings, ImitationProblem, TakeTable, TerminationSettings
 from egopose.envs.starts import FragmentLike, Starts, UniformStarts, WholeFragments, after_context
@@ -26,6 +27,7 @@ def build_problem(
     reward: Mapping[str, Any],
     *,
     action_reference: Tensor | None = None,
+    futures: Futures | None = None,
 ) -> ImitationProblem:
     """The imitation problem of a ``conf/task`` and a ``conf/reward`` file.
 
@@ -40,6 +42,7 @@ def build_problem(
         ActionSettings(**task["action"]),
         TerminationSettings(**task["termination"]),
         action_reference,
+        futures,
     )
 
 

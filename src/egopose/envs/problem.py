@@ -10,6 +10,7 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
+from egopose.envs.futures import Futures
 from egopose.envs.mdp import terminations
 from egopose.envs.mdp.observations import BodyLayout, BodyState, BodyView
 from egopose.envs.mdp.rewards import Reward
@@ -98,6 +99,7 @@ class ImitationProblem:
         reward: see :mod:`egopose.envs.mdp.rewards`.
         action, termination: settings.
         action_reference: ``[F, nu]`` rad, the base target for reaching each frame; needed by ``regressor``.
+        futures: kinematic forecasts: episodes begin in their first states in place of the reference's.
 
     Raises:
         ValueError: the reference does not fit the humanoid, or the action's table is missing or of another shape.
@@ -112,6 +114,7 @@ class ImitationProblem:
         action: ActionSettings,
         termination: TerminationSettings,
         action_reference: Tensor | None = None,
+        futures: Futures | None = None,
     ) -> None:
         if action.kind == "torque":
             humanoid = torque_driven(humanoid, action.joint_damping)
@@ -126,7 +129,7 @@ class ImitationProblem:
                 f"reference has {reference['xpos'].shape[1]} bodies, the humanoid {len(humanoid.body_ids)}"
             )
         self.humanoid, self.takes, self.reward = humanoid, takes, reward
-        self.action, self.termination = action, termination
+        self.action, self.termination, self.futures = action, termination, futures
         self.n_frames = reference.shape[0]
         self.reference = reference
         self.layout = BodyLayout(
@@ -170,7 +173,12 @@ class ImitationProblem:
         )
 
     def first_state(self, frame: Tensor) -> tuple[Tensor, Tensor]:
-        """The reference's ``qpos [n, nq]`` and ``qvel [n, nv]`` at global frames ``[n]``, where episodes begin."""
+        """``qpos [n, nq]`` and ``qvel [n, nv]`` of episodes that begin at global frames ``[n]``.
+
+        The reference's, or where it stands and faces the state a forecast begins in.
+        """
+        if self.futures is not None:
+            return self.futures.first_state(frame, self._qpos.index_select(0, frame), self._range.T.numpy())
         return self._qpos.index_select(0, frame), self._qvel.index_select(0, frame)
 
     def view(self, state: BodyState | BodyView) -> BodyView:

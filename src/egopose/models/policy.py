@@ -73,6 +73,7 @@ class PolicySettings:
         context: see :class:`ContextSettings`.
         critic: see :class:`CriticSettings`.
         memory: see :class:`MemorySettings`, or None to read the state itself.
+        base: observation key ``[A]`` (rad) that the network's mean is added to, or None for the mean itself.
     """
 
     hidden: tuple[int, ...]
@@ -85,6 +86,7 @@ class PolicySettings:
     context: ContextSettings
     critic: CriticSettings
     memory: MemorySettings | None = None
+    base: str | None = None
 
     @classmethod
     def from_config(cls, config: Mapping[str, Any]) -> PolicySettings:
@@ -184,8 +186,14 @@ def build_actor(
     feedback = None if settings.feedback is None else BalanceFeedback(settings.feedback, dof_names)
     at = in_keys.index("tracking_error") if feedback is not None else 0
     head = GaussianHead(width, action_size, settings, feedback, at)
-    gaussian = TensorDictModule(head, in_keys=in_keys, out_keys=["loc", "scale"])
-    module = TensorDictSequential(*context, *memory, gaussian)
+    gaussian = [TensorDictModule(head, in_keys=in_keys, out_keys=["loc", "scale"])]
+    if settings.base is not None:
+        if _width(widths, settings.base, "base") != action_size:
+            raise InputError(
+                "model", "base", f"{settings.base!r} has {widths[settings.base]} numbers, not {action_size}"
+            )
+        gaussian.append(TensorDictModule(torch.add, in_keys=["loc", settings.base], out_keys=["loc"]))
+    module = TensorDictSequential(*context, *memory, *gaussian)
     actor = ProbabilisticActor(
         module,
         in_keys=["loc", "scale"],

@@ -1,0 +1,142 @@
+"""Kinematic forecasts as an environment follows them: curves of poses, by the frame they begin at."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+from torchrl.data import Composite, TensorSpec, Unbounded
+from torchrl.envs.transforms import Transform
+
+from egopose.models.motion_forecast import spline_basis
+from egopose.models.pose_regression import state_to_qpos
+from egopose.motion import rotations as rot
+from egopose.motion.rotations import Array
+
+
+class Futures:
+    """Humanoid states at every step of every curve; a step behind a curve's end is its last.
+
+    Args:
+        coefficients: ``[R, K, P]`` of cubic splines, in the pose state's own units (see
+            :mod:`egopose.models.motion_forecast`).
+        starts: ``[R]`` global frames the curves begin at.
+        frames: F of the store.
+        horizon: last step of a curve.
+        spacing: frames between knots.
+        fps: frames per second.
+
+    Raises:
+        ValueError: coefficients of another number than the splines have, or a start outside the store.
+    """
+
+    def __init__(
+        self, coefficients: Tensor, starts: Tensor, frames: int, horizon: int, spacing: int, fps: float
+    ) -> None:
+        self.horizon, self.frames = horizon, frames
+        self._basis, self._slope = spline_basis(horizon + 1, spacing, fps)
+        if coefficients.shape[:2] != (len(starts), self._basis.shape[1]):
+            raise ValueError(f"curves {tuple(coefficients.shape)} of {len(starts)} starts do not fit the splines")
+        if len(starts) and not 0 <= int(starts.min()) <= int(starts.max()) < frames:
+            raise ValueError(f"curves begin outside the store's {frames} frames")
+        self.coefficients, self.starts = coefficients.float(), starts.long()
+        self._row = torch.full((frames,), -1, dtype=torch.int64)
+        self._row[self.starts] = torch.arange(len(starts))
+
+    def put(self, coefficients: Tensor, starts: Tensor) -> None:
+        """Other curves ``[R, K, P]`` for these starts ``[R]``; those of other starts stay."""
+        kept = ~torch.isin(self.starts, starts)
+        self.coefficients = torch.cat([self.coefficients[kept], coefficients.float()])
+        self.starts = torch.cat([self.starts[kept], starts.long()])
+        self._row[self.starts] = torch.arange(len(self.starts))
+
+    def poses(self, start: Tensor, step: Tensor) -> Tensor:
+        """``[N, P]`` pose states at ``step [N]`` of the curves that begin at global frames ``start [N]``."""
+        return self._at(start, step, self._basis)
+
+    def states(self, start: Tensor, step: Tensor) -> Tensor:
+        """Humanoid states z ``[N, 2 P - 11]``, float32, joint velocities those of the curve."""
+        poses = self.poses(start, step)
+        return torch.cat([poses, self.joint_velocities(start, step)], dim=-1)
+
+    def joint_velocities(self, start: Tensor, step: Tensor) -> Tensor:
+        """``[N, D]`` rad/s."""
+        return self._at(start, step, self._slope, 5, -6)
+
+    def first_state(self, start: Tensor, reference: Tensor, joint_range: Array) -> tuple[Tensor, Tensor]:
+        """``qpos [N, nq]`` and ``qvel [N, nv]`` at the curves' beginnings, standing and facing as ``reference``'s."""
+        where = reference.double().numpy()
+        states = self.states(start, torch.zeros_like(start)).double().numpy()
+        placed = state_to_qpos(states, where[:, :2], rot.heading(where[:, 3:7]), joint_range)
+        return torch.from_numpy(placed[0]), torch.from_numpy(placed[1])
+
+    def _at(self, start: Tensor, step: Tensor, basis: Tensor, first: int = 0, last: int | None = None) -> Tensor:
+        row = self._row[start]
+        if bool((row < 0).any()):
+            raise ValueError(f"no forecast begins at frame {int(start[row < 0][0])}")
+        weights = basis[step.clamp(max=self.horizon)]
+        # A cubic spline has four weights at a step: the rest are zero.
+        at = (weights != 0).float().argmax(dim=1).clamp(max=basis.shape[1] - 4)
+        near = at[:, None] + torch.arange(4)
+        curves = self.coefficients[row[:, None], near][..., first:last]
+        return (weights.gather(1, near).unsqueeze(-1) * curves).sum(dim=1)
+
+
+class FollowFuture(Transform):
+    """What a policy needs to follow a curve. To stand before :class:`egopose.envs.transforms.StateNormalizer`.
+
+    Writes ``followed_targets [nu]``, rad from the rest pose: the joint angles the curve has at the next step, and its
+    velocity there times a part of a PD controller's lag; ``tracking_error [2 S]``, as
+    :class:`egopose.envs.transforms.TrackingError`: the state's scaled error against the curve, and the curve's scaled
+    step to the next frame; ``visual_context``, the scaled poses of the steps ``ahead``.
+
+    Args:
+        futures: the curves.
+        scale: ``[S]``, what a unit of each number is divided by (a deviation).
+        rest: ``[nu]`` rad.
+        lag: ``[nu]`` s.
+        clip: bound of the scaled errors.
+        ahead: steps from the present one.
+    """
+
+    scale: Tensor
+
+    def __init__(
+        self, futures: Futures, scale: Tensor, rest: Tensor, lag: Tensor, clip: float, ahead: Sequence[int]
+    ) -> None:
+        super().__init__(
+            in_keys=["humanoid_state", "episode_start", "episode_step"],
+            out_keys=["followed_targets", "tracking_error", "visual_context"],
+        )
+        self.futures, self.rest, self.lag, self.clip, self.ahead = futures, rest, lag, clip, tuple(ahead)
+        # A buffer: a policy must see other data in the units it was trained in.
+        self.register_buffer("scale", scale)
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Writes :attr:`out_keys` from the raw ``humanoid_state`` and the episode's clock."""
+        start, step = tensordict["episode_start"].squeeze(-1), tensordict["episode_step"].squeeze(-1)
+        now, following = self.futures.states(start, step), self.futures.states(start, step + 1)
+        size = self.futures.coefficients.shape[-1]
+        angles, rates = following[..., 5 : size - 6], following[..., size:]
+        tensordict.set("followed_targets", (angles.double() + self.lag * rates - self.rest).float())
+        error = torch.stack([tensordict["humanoid_state"] - now, following - now], dim=-2).div_(self.scale)
+        tensordict.set("tracking_error", error.clamp_(-self.clip, self.clip).flatten(-2))
+        later = [self.futures.poses(start, step + ahead) / self.scale[:size] for ahead in self.ahead]
+        return tensordict.set("visual_context", torch.cat(later, dim=-1))
+
+    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
+        return self.forward(next_tensordict)
+
+    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
+        return self.forward(tensordict_reset)
+
+    def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
+        assert isinstance(observation_spec, Composite)
+        size = self.futures.coefficients.shape[-1]
+        widths = (len(self.rest), 2 * len(self.scale), size * len(self.ahead))
+        for key, width in zip(self.out_keys, widths, strict=True):
+            shape = (*observation_spec.shape, width)
+            observation_spec[key] = Unbounded(shape, dtype=torch.float32, device=observation_spec.device)
+        return observation_spec

@@ -1,0 +1,82 @@
+"""A kinematic forecast of motion: from the states a context shows to a smooth curve of poses, all frames in one go.
+
+Recurrent forecasters feed their own output back and drift; a curve in a spline basis has nothing to feed back, is
+smooth by construction, and shrinks to the mean motion as far as the context is uncertain. (Mao et al., ICCV 2019,
+forecast coefficients of a cosine basis likewise; its curves have no slope at their ends, where a forecast begins.)
+
+A pose is the first ``P = 11 + D`` numbers of the humanoid state z: root height, de-headed root quaternion, D joint
+angles, root linear velocity (heading frame) and root angular velocity (root frame).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from scipy.interpolate import BSpline
+from torch import Tensor, nn
+
+
+def spline_basis(frames: int, spacing: int, fps: float) -> tuple[Tensor, Tensor]:
+    """Cubic B-splines over steps ``0 .. frames - 1``: values ``[frames, K]``, and their derivatives (1/s).
+
+    Args:
+        frames: steps.
+        spacing: frames between knots, about; the ends are knots.
+        fps: frames per second.
+
+    Raises:
+        ValueError: fewer than two frames, or a spacing that is not positive.
+    """
+    if frames < 2 or spacing < 1:
+        raise ValueError(f"a spline needs two frames and a positive spacing, got {frames} and {spacing}")
+    inner = np.linspace(0.0, frames - 1.0, max(1, round((frames - 1) / spacing)) + 1)
+    knots = np.concatenate([[inner[0]] * 3, inner, [inner[-1]] * 3])
+    count = len(knots) - 4
+    at = np.arange(frames, dtype=np.float64)
+    spline = BSpline(knots, np.eye(count), 3)
+    return torch.from_numpy(spline(at)).float(), torch.from_numpy(spline.derivative()(at) * fps).float()
+
+
+class MotionForecaster(nn.Module):
+    """Context of poses -> spline coefficients of the poses from its last frame on; inside in the training deviations.
+
+    The curve is a share of the last pose and of the context's mean pose, learned for each coefficient and number, plus
+    what a recurrent network adds.
+
+    Args:
+        mean, std: ``[P]`` of the pose states trained on; buffers, saved with the weights.
+        recurrent: units of the network's GRU.
+        hidden: units of the layer after it.
+        dropout: before and after that layer.
+        coefficients: K.
+    """
+
+    mean: Tensor
+    std: Tensor
+
+    def __init__(
+        self, mean: Tensor, std: Tensor, recurrent: int, hidden: int, dropout: float, coefficients: int
+    ) -> None:
+        super().__init__()
+        size = len(mean)
+        self.register_buffer("mean", mean.to(torch.float32))
+        self.register_buffer("std", std.to(torch.float32))
+        self.gru = nn.GRU(size, recurrent, batch_first=True)
+        out = nn.Linear(hidden, coefficients * size)
+        nn.init.zeros_(out.weight)
+        nn.init.zeros_(out.bias)
+        self.head = nn.Sequential(
+            nn.Dropout(dropout), nn.Linear(recurrent, hidden), nn.ReLU(), nn.Dropout(dropout), out
+        )
+        #: ``[2, K, P]``: shares of the last and of the mean pose.
+        self.kept = nn.Parameter(torch.full((2, coefficients, size), 0.25))
+
+    def normalise(self, poses: Tensor) -> Tensor:
+        """Pose states ``[..., P]`` in their own units -> in deviations, float32."""
+        return ((poses - self.mean) / self.std).to(torch.float32)
+
+    def forward(self, context: Tensor) -> Tensor:
+        """Context ``[B, C, P]`` in deviations -> coefficients ``[B, K, P]``."""
+        seen, _ = self.gru(context)
+        added = self.head(seen[:, -1]).unflatten(-1, self.kept.shape[1:])
+        return context[:, -1:] * self.kept[0] + context.mean(dim=1, keepdim=True) * self.kept[1] + added

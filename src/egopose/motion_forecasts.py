@@ -1,0 +1,160 @@
+"""From a configuration to the kinematic forecasts a policy follows: trained once a run, kept in ``RUN_DIR/forecaster``.
+
+Forecasts that begin at training frames are those of networks that have not seen the frames around them, nor any they
+forecast: a policy must not trust them more than it may on new takes.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import Tensor, nn
+
+from egopose.data.preparation import global_spans, store_folder
+from egopose.data.splits import split_takes
+from egopose.data.store import TakeStore
+from egopose.envs.futures import Futures
+from egopose.envs.mdp.observations import humanoid_state
+from egopose.errors import InputError
+from egopose.evaluation.forecasting import ForecastWindow
+from egopose.inference.forecaster import placed_states
+from egopose.material import Material
+from egopose.models.motion_forecast import MotionForecaster
+from egopose.training.baselines import FitSettings, fit
+from egopose.training.checkpoint import ComponentState, RunCheckpoint, metadata_of
+from egopose.training.fragments import Span, cross_fit_blocks, without_block
+from egopose.training.motion_forecast import ForecasterSettings, ForecastLearner, build_forecaster
+
+if TYPE_CHECKING:
+    from egopose.pipeline import Agent
+
+FOLDER = "forecaster"
+
+
+def with_futures(config: Mapping[str, Any], material: Material, run: Path) -> Material:
+    """The material with the run's forecasts, trained where that has not been done; itself where it has no forecaster.
+
+    Args:
+        config: resolved; its group ``forecaster`` says how, or is null.
+        material: with the states a regressor sees.
+        run: the run directory.
+
+    Raises:
+        InputError: a setting is wrong, there are no regressed states, or what is kept is damaged.
+    """
+    if config.get("forecaster") is None:
+        return material
+    settings, _ = _settings(config)
+    folder = run / FOLDER
+    if not folder.is_dir():
+        _train(config, material, folder)
+    saved: dict[str, Tensor] = {}
+    RunCheckpoint({"futures": ComponentState(dict, saved.update)}).restore(folder, {"futures"})
+    return replace(material, futures=_futures(material, settings, saved["coefficients"], saved["starts"]))
+
+
+def begin_forecasts(agent: Agent, windows: Sequence[ForecastWindow], pasts: Tensor) -> tuple[Tensor, Tensor]:
+    """Where forecasts of ``windows`` begin: ``qpos [W, nq]`` and ``qvel [W, nv]``, placed where the reference is.
+
+    That is the last state of ``pasts [W, context, S]``; where the agent follows kinematic forecasts, it is where those
+    begin, and from now on the agent follows, from these frames, the ones that have seen ``pasts`` alone.
+    """
+    material = agent.material
+    now = torch.tensor([int(material.takes.offsets[w.take]) + w.now for w in windows])
+    where = torch.as_tensor(material.reference["qpos"][now]).double()
+    limits = material.humanoid.joint_range
+    if material.futures is None:
+        return placed_states(pasts[:, -1].numpy(), where.numpy(), limits)
+    settings, _ = _settings(agent.config)
+    size = material.futures.coefficients.shape[-1]
+    members = _members(settings, agent.path.resolve().parent.parent / FOLDER, size, _fps(material))
+    curves = _curves(members, members[0].normalise(pasts[..., :size]))
+    material.futures.put(curves, now)
+    return material.futures.first_state(now, where, limits)
+
+
+def _settings(config: Mapping[str, Any]) -> tuple[ForecasterSettings, FitSettings]:
+    values = {key: value for key, value in config["forecaster"].items() if key != "optimiser"}
+    return ForecasterSettings.from_config(values), FitSettings.from_config(config["forecaster"]["optimiser"])
+
+
+def _fps(material: Material) -> float:
+    return 1.0 / material.humanoid.control_dt
+
+
+def _futures(material: Material, settings: ForecasterSettings, coefficients: Tensor, starts: Tensor) -> Futures:
+    frames = len(material.reference)
+    return Futures(coefficients, starts, frames, settings.horizon, settings.spacing, _fps(material))
+
+
+@torch.no_grad()
+def _curves(members: Sequence[MotionForecaster], contexts: Tensor) -> Tensor:
+    """Mean curve of the members ``[W, K, P]`` in the pose's own units, from contexts ``[W, C, P]`` in deviations."""
+    mean, std = members[0].mean, members[0].std
+    parts = [torch.stack([member(part) for member in members]).mean(0) for part in contexts.split(512)]
+    return torch.cat(parts) * std + mean
+
+
+def _train(config: Mapping[str, Any], material: Material, folder: Path) -> None:
+    """Fit all networks; write ``folder`` whole or not at all."""
+    if material.states is None:
+        raise InputError("configuration", "forecaster", "needs a trained state regressor")
+    settings, optimiser = _settings(config)
+    store = TakeStore.open(store_folder(config))
+    pieces = split_takes(store.takes, config["data"]["split"], "train", supported_only=False)
+    spans = [Span(*span) for span in global_spans(store, pieces)]
+    truth, seen = humanoid_state(material.reference).float(), material.states
+    size = 11 + (truth.shape[1] - 11) // 2
+    truth, seen = truth[:, :size], seen[:, :size]
+    hands, seed, fps = [int(d) for d in material.humanoid.hand_dofs], int(config["seed"]), _fps(material)
+
+    def members(fragments: Sequence[Span], label: str) -> list[MotionForecaster]:
+        out: list[MotionForecaster] = []
+        for number in range(settings.members):
+            share = optimiser.validation_share
+            draw = seed * 1000 + number
+            learner = ForecastLearner(seen, truth, fragments, hands, settings, fps, optimiser.batch, share, draw)
+            result = fit(learner, optimiser, draw, settings.total_frames)
+            print(
+                f"forecaster{label} {number}: held out E_pose {result.held_out:.3f} after {result.frames} frames",
+                file=sys.stderr,
+                flush=True,
+            )
+            out.append(learner.model)
+        return out
+
+    whole = members(spans, "")
+    coefficients, starts = [], []
+    for fold, block in enumerate(cross_fit_blocks(spans, settings.cross_fit)):
+        others = without_block(spans, block, settings.horizon, settings.context + 2)
+        fitted = members(others, f" without block {fold}")
+        for piece in block:
+            first = next(s.start for s in spans if s.start <= piece.start < s.stop) + settings.context - 1
+            now = torch.arange(min(max(piece.start, first), piece.stop), piece.stop)
+            if len(now):
+                rows = seen[now[:, None] + torch.arange(1 - settings.context, 1)]
+                coefficients.append(_curves(fitted, fitted[0].normalise(rows)))
+                starts.append(now)
+    table = {"coefficients": torch.cat(coefficients), "starts": torch.cat(starts)}
+    network = nn.ModuleList(whole)
+    part = folder.with_name(f"{FOLDER}.part")
+    shutil.rmtree(part, ignore_errors=True)
+    made = {"members": network, "futures": ComponentState(lambda: table, lambda _: None)}
+    RunCheckpoint(made).save(part, metadata=metadata_of("motion forecaster", size, 0, 0, 0.0))
+    os.replace(part, folder)
+
+
+def _members(settings: ForecasterSettings, folder: Path, size: int, fps: float) -> list[MotionForecaster]:
+    zero, one = torch.zeros(size), torch.ones(size)
+    members = [build_forecaster(settings, zero, one, fps, 0) for _ in range(settings.members)]
+    network = nn.ModuleList(members)
+    RunCheckpoint({"members": network}).restore(folder, {"members"})
+    network.eval()
+    return members

@@ -1,0 +1,170 @@
+"""Training of the kinematic forecast: from what the state regressor sees to the motion that followed."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from egopose.config import from_mapping
+from egopose.errors import InputError
+from egopose.models.motion_forecast import MotionForecaster, spline_basis
+from egopose.models.regressor import state_statistics
+from egopose.training.fragments import Span, split_validation
+
+
+@dataclass(frozen=True)
+class ForecasterSettings:
+    """The group ``conf/forecaster``, without its ``optimiser``.
+
+    Args:
+        recurrent, hidden, dropout: see :class:`MotionForecaster`.
+        spacing: frames between the curve's knots.
+        context, horizon: frames seen and frames forecast.
+        std_floor: of the deviations poses are divided by.
+        input_noise: deviations added to each context, one draw a number, and as much again a frame.
+        other_weight: of the squared error, in deviations, of what E_pose does not see: height, root velocities, hands.
+        cross_fit: forecasters for the training frames, each of which has not seen its own part of them.
+        members: networks whose curves are averaged.
+        total_frames: of motion each network learns from, counted as often as they are seen.
+    """
+
+    recurrent: int
+    hidden: int
+    dropout: float
+    spacing: int
+    context: int
+    horizon: int
+    std_floor: float
+    input_noise: float
+    other_weight: float
+    cross_fit: int
+    members: int
+    total_frames: int
+
+    @classmethod
+    def from_config(cls, values: Mapping[str, Any], source: str = "conf/forecaster") -> ForecasterSettings:
+        """Raises InputError: a key is missing, unknown or out of range; names it."""
+        settings = from_mapping(cls, values, source)
+        least = {"recurrent": 1, "hidden": 1, "spacing": 1, "context": 1, "horizon": 2, "cross_fit": 2, "members": 1}
+        for name, value in least.items():
+            if getattr(settings, name) < value:
+                raise InputError(source, name, f"must be at least {value}, not {getattr(settings, name)}")
+        return settings
+
+
+def build_forecaster(
+    settings: ForecasterSettings, mean: Tensor, std: Tensor, fps: float, seed: int
+) -> MotionForecaster:
+    """An untrained network for pose states of these statistics ``[P]``, its start drawn from ``seed``."""
+    count = spline_basis(settings.horizon + 1, settings.spacing, fps)[0].shape[1]
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        return MotionForecaster(mean, std, settings.recurrent, settings.hidden, settings.dropout, count)
+
+
+class ForecastLearner:
+    """A :class:`egopose.training.baselines.Learner` of windows of context and horizon.
+
+    The loss is E_pose (Yuan & Kitani 2019, section 4.3) of every frame of the curve, root angles for small leans, and a
+    little of all else a body needs to follow it.
+
+    Args:
+        contexts: ``[F, P]`` pose states as seen, by a state regressor that was not trained on the frame.
+        poses: ``[F, P]`` true ones.
+        fragments: training stretches, in global frames; the held-out frames are cut from their ends.
+        hands: columns of the joint angles that belong to the hands.
+        settings: of the network.
+        fps: frames per second.
+        batch: windows a step.
+        validation_share: of each fragment, held out.
+        seed: of the network's start.
+
+    Raises:
+        InputError: no fragment holds a context and two frames more.
+    """
+
+    def __init__(
+        self,
+        contexts: Tensor,
+        poses: Tensor,
+        fragments: Sequence[Span],
+        hands: Sequence[int],
+        settings: ForecasterSettings,
+        fps: float,
+        batch: int,
+        validation_share: float,
+        seed: int,
+    ) -> None:
+        self.settings, self.batch = settings, batch
+        train, kept = split_validation(fragments, validation_share, settings.context)
+        self.train = torch.tensor([list(s) for s in train if s.stop - s.start >= settings.context + 2]).reshape(-1, 2)
+        if len(self.train) == 0:
+            raise InputError("forecaster", "fragments", f"none is longer than {settings.context} + 2 frames")
+        rows = torch.cat([poses[a:b] for a, b in self.train.tolist()])
+        self.model = build_forecaster(settings, *state_statistics(rows, settings.std_floor), fps, seed)
+        self.contexts, self.poses = self.model.normalise(contexts), self.model.normalise(poses)
+        self.basis = spline_basis(settings.horizon + 1, settings.spacing, fps)[0]
+        self.judged, self.others = _scales(self.model.std, hands)
+        self.windows = self._windows([span for span, _ in kept], settings.context)
+
+    def loss(self, generator: torch.Generator, progress: float) -> tuple[Tensor, int]:
+        """E_pose and the rest of a batch of random windows; ``progress`` is not read."""
+        spans = self.train[self._draw(generator)]
+        first, last = spans[:, 0] + self.settings.context - 1, spans[:, 1] - 2
+        now = first + (torch.rand(self.batch, generator=generator) * (last - first + 1)).long()
+        seen = self._context(now)
+        scale = self.settings.input_noise
+        seen = seen + scale * torch.randn(len(now), 1, seen.shape[-1], generator=generator)
+        seen = seen + scale * torch.randn(seen.shape, generator=generator)
+        judged, others, inside = self._errors(seen, now, spans[:, 1])
+        loss = (judged + self.settings.other_weight * others)[inside].mean()
+        return loss, int(inside.sum()) + len(now) * (self.settings.context - 1)
+
+    @torch.no_grad()
+    def held_out(self) -> float:
+        """E_pose, rad, of the curves from held-out contexts; NaN where there are none."""
+        if not len(self.windows):
+            return math.nan
+        judged, _, inside = self._errors(self._context(self.windows[:, 0]), *self.windows.unbind(1))
+        return float(judged[inside].mean())
+
+    def _errors(self, seen: Tensor, now: Tensor, stops: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """E_pose and the mean square of what it leaves out ``[B, T]``, and which frames the take has ``[B, T]``."""
+        curve = self.basis @ self.model(seen)
+        frames = now[:, None] + torch.arange(len(self.basis))
+        inside = frames < stops[:, None]
+        error = curve - self.poses[torch.minimum(frames, stops[:, None] - 1)]
+        judged = ((error * self.judged).square().sum(-1) + 1e-6).sqrt()
+        return judged, (error.square() * self.others).sum(-1) / self.others.sum(), inside
+
+    def _context(self, now: Tensor) -> Tensor:
+        return self.contexts[now[:, None] + torch.arange(1 - self.settings.context, 1)]
+
+    def _draw(self, generator: torch.Generator) -> Tensor:
+        """``[batch]`` fragments, each as often as forecasts can begin in it."""
+        starts = (self.train[:, 1] - self.train[:, 0] - self.settings.context).double()
+        return torch.multinomial(starts, self.batch, replacement=True, generator=generator)
+
+    def _windows(self, spans: Sequence[Span], context: int) -> Tensor:
+        """``[W, 2]`` last frame of each context, and where its fragment ends; one window every half context."""
+        step = max(1, context // 2)
+        windows = [[at, s.stop] for s in spans for at in range(s.start + context - 1, s.stop - 2, step)]
+        return torch.tensor(windows, dtype=torch.int64).reshape(-1, 2)
+
+
+def _scales(std: Tensor, hands: Sequence[int]) -> tuple[Tensor, Tensor]:
+    """``[P]`` what errors in deviations are multiplied by in E_pose, and ``[P]`` which numbers it leaves out (0 or 1).
+
+    A small lean is twice the quaternion's x and y; w and z follow from these.
+    """
+    judged, others = std.clone(), torch.zeros_like(std)
+    judged[0], judged[-6:], others[0], others[-6:] = 0.0, 0.0, 1.0, 1.0
+    judged[1:5] = std[1:5] * torch.tensor([0.0, 2.0, 2.0, 0.0])
+    for hand in hands:
+        judged[5 + hand], others[5 + hand] = 0.0, 1.0
+    return judged, others
