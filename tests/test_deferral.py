@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 
 import pytest
@@ -74,6 +75,61 @@ def test_a_batch_is_what_torchrls_collector_gives_of_an_environment_that_defers_
             exact = {"rtol": 0, "atol": 0}
             close = {"rtol": 1e-6, "atol": 1e-6}
             torch.testing.assert_close(got[key], batch[key], **(close if key == "action_log_prob" else exact))
+
+
+class Steady(nn.Module):
+    """Actions that depend on their own world alone, and next to nothing on chance."""
+
+    def forward(self, state: Tensor) -> tuple[Tensor, Tensor]:
+        mean = 0.3 * state[:, 5:25].sin()
+        return mean, torch.full_like(mean, 1e-9)
+
+
+def test_lanes_that_take_turns_give_what_all_worlds_in_step_give() -> None:
+    def steady_env(number: int) -> TransformedEgoPoseEnv:
+        base = environment(WORLDS, seed=3)
+        return TransformedEgoPoseEnv(
+            base, StateNormalizer(base.observation_spec["humanoid_state"].shape[-1], frozen=True)
+        )
+
+    actor = ProbabilisticActor(
+        TensorDictModule(Steady(), in_keys=["humanoid_state"], out_keys=["loc", "scale"]),
+        in_keys=["loc", "scale"],
+        distribution_class=IndependentNormal,
+        return_log_prob=True,
+    )
+    together, in_turn = (
+        build_collector(replace(SETTINGS, lanes=lanes, physics_threads=2), steady_env, actor, WORLDS * STEPS)
+        for lanes in (1, 2)
+    )
+    for _, a, b in zip(range(3), together, in_turn, strict=False):
+        assert a["next", "done"].any()
+        assert set(a.keys(True, True)) == set(b.keys(True, True))
+        for key in a.keys(True, True):
+            if key != "action_log_prob":  # of a draw that differs in the twelfth digit
+                torch.testing.assert_close(a[key], b[key], rtol=1e-5, atol=1e-5)
+
+
+def test_a_lane_that_is_resumed_goes_on_to_the_bit() -> None:
+    build = partial(build_collector, replace(SETTINGS, lanes=2), make_env, make_actor(make_env()), WORLDS * STEPS)
+    first, second = build(), build()
+    batches, again = iter(first), iter(second)
+    next(batches)
+    load_transform_state(second, {key: value.clone() for key, value in transform_state(first).items()})
+    load_simulation_state(second, simulation_state(first))
+    torch.manual_seed(4)
+    expected = [next(batches).clone() for _ in range(2)]
+    torch.manual_seed(4)
+    for batch in expected:
+        assert (batch == next(again)).all()
+
+
+def test_a_batch_of_lanes_can_be_learned_from() -> None:
+    collector = build_collector(replace(SETTINGS, lanes=2), make_env, make_actor(make_env()), WORLDS * STEPS)
+    batch = next(iter(collector))
+    weight = torch.ones(batch["humanoid_state"].shape[-1], requires_grad=True)
+    (batch["humanoid_state"] @ weight).sum().backward()
+    assert weight.grad is not None
 
 
 def test_a_diverged_world_earns_nothing_when_its_reward_comes_late() -> None:

@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-_STEPS_A_ROUND = 32  # control steps of every world: with 64 worlds about two seconds of physics at 450 Hz
-
 
 def run(overrides: Sequence[str], rounds: int) -> dict[str, Any]:
     """The full collection loop beside raw ``mj_step`` of the same model, substeps, threads and states.
@@ -35,7 +33,7 @@ def run(overrides: Sequence[str], rounds: int) -> dict[str, Any]:
     set_threads(settings.threads)
     env = pipeline.build_env(config, material, worlds=settings.worlds, threads=settings.physics_threads)
     actor, _ = pipeline.build_networks(config, material, env)
-    collector = build_collector(settings, lambda _: env, actor, settings.worlds * _STEPS_A_ROUND)
+    collector = build_collector(settings, lambda _: env, actor, int(config["algo"]["steps_per_iteration"]))
     settle_heap()
     try:
         return compare_with_raw(iter(collector), base_env(env).physics, rounds)

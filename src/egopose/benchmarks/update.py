@@ -84,7 +84,9 @@ def _taken_apart(
 ) -> dict[str, float]:
     """Seconds of one iteration by part, each without the parts inside it.
 
-    ``other_environment`` is what is left of a step, ``collector`` TorchRL's own and the assembling of the batch,
+    In collection these are the acting thread's: the physics' threads work beside it, and ``waiting_for_physics`` is
+    what they still need when it is through. ``other_environment`` is what is left of a step, ``collector`` TorchRL's
+    own and the assembling of the batch,
     ``gradients`` the way back through the networks, ``kl`` the divergence that the step size follows.
     """
     spent: dict[str, float] = defaultdict(float)
@@ -110,11 +112,12 @@ def _taken_apart(
         object.__setattr__(owner, name, outer)
 
     base = env.base_env
-    timed(collector.policy, "forward", "policy")
+    timed(collector.policy, "act", "policy")
     timed(collector, "postproc", "policy")  # the actions' probabilities
-    timed(base, "rewards_due", "reward")
-    timed(env, "step_and_maybe_reset", "other_environment")
-    timed(base.physics, "step", "physics_and_kinematics")
+    timed(base, "_reward_waiting", "reward")
+    timed(env, "end_step", "other_environment")
+    timed(env, "begin_step", "other_environment")
+    timed(base.physics, "end_step", "waiting_for_physics")
     timed(base.problem, "observation", "observation")
     timed(env.transform, "_step", "transforms")
     timed(env.transform, "_reset", "resets")

@@ -24,14 +24,18 @@ class StepRecorder:
     ctrls: list[Array] = field(default_factory=list)
 
     def __post_init__(self) -> None:
-        step = self.physics.step
+        begin, parts = self.physics._begin, []
 
-        def recorded(ctrl: Array) -> Any:
-            self.states.append(self.physics.state.copy())
-            self.ctrls.append(ctrl.copy())
-            return step(ctrl)
+        def recorded(ctrl: Array, worlds: slice, threads: int) -> Any:
+            parts.append((self.physics.state[worlds].copy(), ctrl.copy()))
+            # Ranges of worlds take turns, in order.
+            if sum(len(part) for _, part in parts) == self.physics.n_worlds:
+                for record, columns in zip((self.states, self.ctrls), zip(*parts, strict=True), strict=True):
+                    record.append(np.concatenate(columns))
+                parts.clear()
+            return begin(ctrl, worlds, threads)
 
-        self.physics.step = recorded  # type: ignore[method-assign]
+        self.physics._begin = recorded  # type: ignore[method-assign]
 
     def clear(self) -> None:
         """Forget what was recorded."""

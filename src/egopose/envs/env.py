@@ -5,7 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.data import Binary, Composite, Unbounded
@@ -14,7 +16,7 @@ from torchrl.envs import EnvBase
 from egopose.envs.mdp.observations import BodyState, BodyView
 from egopose.envs.problem import ImitationProblem
 from egopose.envs.starts import Starts
-from egopose.humanoid.physics import BatchedPhysics
+from egopose.humanoid.physics import ALL, Array, BatchedPhysics
 
 _STEPS_REWARDED_AT_ONCE = 8  # of all worlds: measured, at 64 worlds; twice or half as many are as quick
 
@@ -94,8 +96,9 @@ class EgoPoseEnv(EnvBase):
         self._take, self._start, self._stop, self._frame = (counter.clone() for _ in range(4))
         self.placed = torch.zeros(n_worlds, humanoid.mj_model.nu, dtype=torch.float64)
         self._unrewarded: list[_Unrewarded] | None = None
-        self._unknown_reward = torch.full((n_worlds, 1), torch.nan)
+        self._earnings: list[Tensor] = []
         self._no_flags = _no_flags(self.batch_size)
+        self._unknown_reward = torch.full((n_worlds, 1), torch.nan)
         self._make_specs()
 
     def _make_specs(self) -> None:
@@ -142,16 +145,17 @@ class EgoPoseEnv(EnvBase):
         Raises:
             RuntimeError: rewards are not deferred, or no step was taken.
         """
-        if not self._unrewarded:
+        self._reward_waiting()
+        if not self._earnings:
             raise RuntimeError("no step waits for its reward")
-        steps, self._unrewarded = self._unrewarded, []
-        # Some at a time: what is worked out between fits the core's cache.
-        parts = [
-            self._earned(*_joined(steps[i : i + _STEPS_REWARDED_AT_ONCE]))
-            for i in range(0, len(steps), _STEPS_REWARDED_AT_ONCE)
-        ]
-        earned = torch.cat(parts).unflatten(0, (len(steps), -1)).permute(2, 1, 0).contiguous()
+        earned, self._earnings = torch.cat(self._earnings), []
+        earned = earned.unflatten(0, (-1, self.batch_size[0])).permute(2, 1, 0).contiguous()
         return dict(zip(("reward", *self.problem.reward.names), earned.unsqueeze(-1).unbind(), strict=True))
+
+    def _reward_waiting(self) -> None:
+        if self._unrewarded:
+            steps, self._unrewarded = self._unrewarded, []
+            self._earnings.append(self._earned(*_joined(steps)))
 
     def _earned(self, state: BodyState | BodyView, frame: Tensor, step: Tensor, diverged: Tensor) -> Tensor:
         """Reward and terms ``[n, 1 + K]`` float32 at global frames ``[n]``; a diverged world earns nothing."""
@@ -185,10 +189,10 @@ class EgoPoseEnv(EnvBase):
                 self._begin(worlds)
         return self.observe()
 
-    def begin(self, worlds: Tensor) -> TensorDict:
-        """Begin an episode in each of ``worlds [n]``; their first observations, batch ``[n]``."""
+    def begin(self, worlds: Tensor) -> dict[str, Any]:
+        """Begin an episode in each of ``worlds [n]``; the entries of their first observations."""
         self._begin(worlds)
-        return self.observe(worlds)
+        return self._observed(worlds)
 
     def _begin(self, worlds: Tensor, *state: Tensor) -> None:
         episodes = self.starts(worlds, self._generator)
@@ -217,26 +221,27 @@ class EgoPoseEnv(EnvBase):
         if self.problem.action.reference == "start":
             self.placed[worlds] = qpos[:, 7:].double()
 
-    def observe(self, worlds: Tensor | None = None) -> TensorDict:
+    def observe(self, worlds: Tensor | slice = ALL) -> TensorDict:
         """The present observation of ``worlds [n]`` (default all), as a reset would return it (after :meth:`place`)."""
+        entries = self._observed(worlds)
+        return TensorDict(entries, batch_size=entries["done"].shape[:1])
+
+    def _observed(self, worlds: Tensor | slice) -> dict[str, Any]:
         # The state z needs no kinematics, and concatenating makes a copy of it.
-        rows = slice(None) if worlds is None else worlds.numpy()
+        rows = worlds if isinstance(worlds, slice) else worlds.numpy()
         qpos, qvel = self.physics.qpos[rows], self.physics.qvel[rows]
         z = self.problem.observation({"qpos": torch.from_numpy(qpos), "qvel": torch.from_numpy(qvel)}).float()
-        size = z.shape[:1]
-        return TensorDict(
-            {
-                **self._clock(worlds),
-                "humanoid_state": z,
-                **self._terms(torch.zeros(*size, len(self.problem.reward.names))),
-                **_no_flags(size),
-            },
-            batch_size=size,
-        )
+        return {
+            **self._clock(worlds),
+            "humanoid_state": z,
+            **self._terms(torch.zeros(len(z), len(self.problem.reward.names))),
+            **_no_flags(z.shape[:1]),
+        }
 
-    def ongoing(self, fallen: Tensor) -> dict[str, Tensor]:
-        """Counters and flags of all worlds where those that were done have begun anew; ``fallen`` ``[N, 1]`` before."""
-        return {**self._clock(), **self._no_flags, "fallen": fallen}
+    def ongoing(self, fallen: Tensor, worlds: slice = ALL) -> dict[str, Tensor]:
+        """Counters and flags of ``worlds`` where those that were done have begun anew; ``fallen`` ``[n, 1]`` before."""
+        flags = {name: flag[worlds] for name, flag in self._no_flags.items()}
+        return {**self._clock(worlds), **flags, "fallen": fallen}
 
     def _terms(self, columns: Tensor) -> dict[str, TensorDict]:
         """``reward_terms`` of ``[n, K]``, unless they are deferred."""
@@ -245,45 +250,64 @@ class EgoPoseEnv(EnvBase):
         terms = dict(zip(self.problem.reward.names, columns.split(1, dim=-1), strict=True))
         return {"reward_terms": TensorDict(terms, batch_size=columns.shape[:1])}
 
-    def _clock(self, worlds: Tensor | None = None) -> dict[str, Tensor]:
-        counters = [self._frame, self._start, self._stop]
-        if worlds is not None:
-            counters = [counter.index_select(0, worlds) for counter in counters]
-        frame, start, stop = (counter.unsqueeze(-1) for counter in counters)
+    def _clock(self, worlds: Tensor | slice = ALL) -> dict[str, Tensor]:
+        frame, start, stop = (counter[worlds].unsqueeze(-1) for counter in (self._frame, self._start, self._stop))
         return {"frame": frame, "episode_start": start, "episode_stop": stop, "episode_step": frame - start}
 
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
+        stopped = self.physics.step(self._target(tensordict["action"], ALL))
+        return TensorDict(self._arrived(stopped, ALL), batch_size=self.batch_size)
+
+    def begin_step(self, action: Tensor, worlds: slice) -> None:
+        """Have the physics' threads take a step of ``worlds``, a range, under ``action [n, A]``, while the caller works
+        for others."""
+        self.physics.begin_step(self._target(action, worlds), worlds)
+
+    def end_step(self, worlds: slice) -> dict[str, Any]:
+        """Wait for what :meth:`begin_step` began; the entries that a step of these worlds alone would have returned.
+
+        With deferred rewards the ranges must take turns, in their order.
+        """
+        return self._arrived(self.physics.end_step(worlds), worlds)
+
+    def _target(self, action: Tensor, worlds: slice) -> Array:
         # A world past its fragment's end (evaluation steps on until the last world is done) stays on its last frame.
-        self._frame = torch.minimum(self._frame + 1, self._stop - 1)
-        target = self.problem.target(tensordict["action"].detach(), self._frame, self.placed)
-        diverged = torch.from_numpy(self.physics.step(target.numpy()).copy())
-        body = {k: torch.from_numpy(v) for k, v in self.physics.body_state().items()}
+        frame = torch.minimum(self._frame[worlds] + 1, self._stop[worlds] - 1)
+        # A new counter, not new values in the old one: that is in the observations given out.
+        self._frame = self._frame.clone()
+        self._frame[worlds] = frame
+        return self.problem.target(action.detach(), frame, self.placed[worlds]).numpy()
+
+    def _arrived(self, stopped: NDArray[np.bool_], worlds: slice) -> dict[str, Any]:
+        diverged = torch.from_numpy(stopped)
+        body = {k: torch.from_numpy(v) for k, v in self.physics.body_state(worlds).items()}
         state = self.problem.view(body)
-        fallen = self.problem.fallen(state, self._take)
+        fallen = self.problem.fallen(state, self._take[worlds])
         terminated = diverged | fallen if self.problem.termination.enabled else diverged
-        truncated = (self._frame >= self._stop - 1) & ~terminated
-        clock = self._clock()
+        frame = self._frame[worlds]
+        truncated = (frame >= self._stop[worlds] - 1) & ~terminated
+        clock = self._clock(worlds)
         steps = clock["episode_step"].squeeze(-1)
         if self._unrewarded is None:
-            earned = self._earned(state, self._frame, steps, diverged)
+            earned = self._earned(state, frame, steps, diverged)
             reward, terms = earned[:, :1], self._terms(earned[:, 1:])
         else:
-            self._unrewarded.append(_Unrewarded(body, self._frame, steps, diverged))
-            reward, terms = self._unknown_reward, {}
-        return TensorDict(
-            {
-                **clock,
-                "humanoid_state": self.problem.observation(state).float(),
-                "reward": reward,
-                **terms,
-                "fallen": fallen.unsqueeze(-1),
-                "diverged": diverged.unsqueeze(-1),
-                "terminated": terminated.unsqueeze(-1),
-                "truncated": truncated.unsqueeze(-1),
-                "done": (terminated | truncated).unsqueeze(-1),
-            },
-            batch_size=self.batch_size,
-        )
+            self._unrewarded.append(_Unrewarded(body, frame, steps, diverged))
+            # Some at a time: what is worked out between fits the core's cache, and the physics goes on meanwhile.
+            if len(self._unrewarded) * len(stopped) >= _STEPS_REWARDED_AT_ONCE * self.batch_size[0]:
+                self._reward_waiting()
+            reward, terms = self._unknown_reward[worlds], {}
+        return {
+            **clock,
+            "humanoid_state": self.problem.observation(state).float(),
+            "reward": reward,
+            **terms,
+            "fallen": fallen.unsqueeze(-1),
+            "diverged": diverged.unsqueeze(-1),
+            "terminated": terminated.unsqueeze(-1),
+            "truncated": truncated.unsqueeze(-1),
+            "done": (terminated | truncated).unsqueeze(-1),
+        }
 
     def state_dict(self, *args: Any, **kwargs: Any) -> dict[str, Tensor]:
         """All that the simulation needs to go on to the bit: physics, episodes, random numbers, counters."""

@@ -2,11 +2,50 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from typing import Any
+
+import torch
 from tensordict import TensorDictBase
+from torch import Tensor
 from torchrl.envs import Compose, TransformedEnv
 from torchrl.envs.transforms import Transform
 
 from egopose.envs.env import EgoPoseEnv
+from egopose.humanoid.physics import ALL
+
+
+class Entries(dict[Any, Any]):
+    """Entries of equal first axis, with as much of a TensorDict's manner as transforms of observations need.
+
+    A TensorDict checks and wraps at every entry it is given, which for 64 worlds costs more than the arithmetic.
+    """
+
+    @property
+    def shape(self) -> torch.Size:
+        """Of the first axis."""
+        return self["done"].shape[:1]
+
+    def get(self, key: Any, default: Any = None) -> Any:
+        """The entry, or ``default``."""
+        return super().get(key, default)
+
+    def set(self, key: Any, value: Any) -> Entries:
+        """Set an entry; returns itself."""
+        self[key] = value
+        return self
+
+    def leaves(self) -> Iterator[tuple[Any, Tensor]]:
+        """Keys and tensors, those of nested TensorDicts by tuples."""
+        for key, value in self.items():
+            if isinstance(value, TensorDictBase):
+                yield from (((key, *_path(inner)), leaf) for inner, leaf in value.items(True, True))
+            else:
+                yield key, value
+
+
+def _path(key: Any) -> tuple[Any, ...]:
+    return key if isinstance(key, tuple) else (key,)
 
 
 class TransformedEgoPoseEnv(TransformedEnv):
@@ -33,23 +72,42 @@ class TransformedEgoPoseEnv(TransformedEnv):
     def step_and_maybe_reset(self, tensordict: TensorDictBase) -> tuple[TensorDictBase, TensorDictBase]:
         """See ``EnvBase.step_and_maybe_reset``: the transition, and what the next step starts from."""
         written = tensordict.get("next", None)
-        base = self.base_env
-        after = self.transform._step(tensordict, base._step(tensordict))
+        after = self.transform._step(tensordict, self.base_env._step(tensordict))
         if written is not None:
             after.update(written.exclude(*after.keys(include_nested=True)))
         tensordict.set("next", after)
-        done = after["done"]
         follows = after.copy()  # of the nested entries too, but not of the tensors
         del follows["reward"]
-        if bool(done.any()):
-            worlds = done.squeeze(-1).nonzero().squeeze(-1)
-            fresh = base.begin(worlds)
-            known = base.ongoing(after["fallen"] & ~done)
-            fresh = self.transform._reset(fresh.empty(), fresh)
-            for key, value in fresh.items(include_nested=True, leaves_only=True):
-                # A hidden state is missing where the actions came from elsewhere.
-                if key in known:
-                    follows.set(key, known[key])
-                elif (before := after.get(key, None)) is not None:
-                    follows.set(key, before.index_copy(0, worlds, value))
+        for key, value in self._begun_anew(after, ALL).items():
+            follows.set(key, value)
         return tensordict, follows
+
+    def begin_step(self, action: Tensor, worlds: slice) -> None:
+        """Have the physics' threads take a step of ``worlds``, a range, under ``action [n, A]``, while the caller works
+        for others."""
+        self.base_env.begin_step(action, worlds)
+
+    def end_step(self, seen: Entries, worlds: slice) -> tuple[Entries, Entries]:
+        """What the step that :meth:`begin_step` began from ``seen`` led to, and what the next one starts from.
+
+        The values are those of :meth:`step_and_maybe_reset`, without a TensorDict around them.
+        """
+        after = self.transform._step(seen, Entries(self.base_env.end_step(worlds)))
+        follows = Entries({**after, **self._begun_anew(after, worlds)})
+        del follows["reward"]
+        return after, follows
+
+    def _begun_anew(self, after: TensorDictBase | Entries, worlds: slice) -> dict[Any, Tensor]:
+        """Begin an episode in those of ``worlds`` that are done ``after`` a step; the entries that this changes."""
+        done = after["done"]
+        if not bool(done.any()):
+            return {}
+        rows = done.squeeze(-1).nonzero().squeeze(-1)
+        base = self.base_env
+        fresh = self.transform._reset(Entries(), Entries(base.begin(rows + (worlds.start or 0))))
+        changed = base.ongoing(after["fallen"] & ~done, worlds)
+        for key, value in fresh.leaves():
+            # A hidden state is missing where the actions came from elsewhere.
+            if key not in changed and (before := after.get(key, None)) is not None:
+                changed[key] = before.index_copy(0, rows, value)
+        return changed

@@ -158,7 +158,7 @@ class StateNormalizer(Transform):
         delta = mean - self.mean
         self.sum_of_squares.add_((values - mean).square_().sum(0)).addcmul_(delta, delta, value=before * n / total)
         self.mean.add_(delta, alpha=n / total)
-        self.count += n
+        self.count.add_(n)
 
     def normalize(self, values: Tensor) -> Tensor:
         """``values [..., D]`` by the present statistics, in their own dtype."""

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
+from queue import SimpleQueue
 from typing import NamedTuple
 
 import mujoco
@@ -13,6 +14,7 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.integer] | slice | list[int]
+ALL = slice(None)
 
 _FULL = mujoco.mjtState.mjSTATE_FULLPHYSICS
 # A world's clock starts here, not at zero: MuJoCo's answer to a state it cannot step is to reset the world in silence,
@@ -86,6 +88,9 @@ class BatchedPhysics:
     own among them, each with one ``MjData`` that stays in its core's cache. Unlike ``mujoco.rollout`` that leaves the
     kinematics of the new state to be had at once, in the same threads.
 
+    :meth:`begin_step` and :meth:`end_step` are the two halves of a :meth:`step` for some of the worlds: between them
+    the caller can work for the others, and threads that are through with these worlds go on to those begun next.
+
     A world *diverges* when its state is not finite, a velocity is beyond ``max_speed``, its control is not finite, or
     MuJoCo warned and reset or stopped it. Its recent states go to a file, it is put back at its last sound state at
     rest, and :attr:`diverged` says so until the next step.
@@ -94,7 +99,7 @@ class BatchedPhysics:
         model: compiled; shared, not copied, never changed.
         n_worlds: N.
         substeps: steps of physics a control step.
-        threads: the caller's and ``threads - 1`` more.
+        threads: that step worlds; in a whole :meth:`step` the caller's is one of them.
         body_ids: ``[B]`` bodies whose pose and mass make up the body state; default all but the world.
         max_speed: m/s and rad/s beyond which a velocity is absurd.
         dump_dir: where the last states of diverged worlds go (``<step>_<world>.npz``), None for nowhere.
@@ -126,13 +131,17 @@ class BatchedPhysics:
         self._max_speed = max_speed
         self._dump_dir, self._max_dumps = None if dump_dir is None else Path(dump_dir), max_dumps
 
-        self._workers = [_Worker(model, substeps, self.body_ids) for _ in range(threads)]
-        self._pool = ThreadPoolExecutor(threads - 1) if threads > 1 else None
+        self._placer = _Worker(model, substeps, self.body_ids)
+        self._idle: SimpleQueue[_Worker] = SimpleQueue()
+        for _ in range(threads):
+            self._idle.put(_Worker(model, substeps, self.body_ids))
+        self._pool = ThreadPoolExecutor(threads)
+        self._begun: dict[int, list[Future[None]]] = {}
         size = mujoco.mj_stateSize(model, _FULL)
         self._qpos = slice(1, 1 + model.nq)
         self._qvel = slice(1 + model.nq, 1 + model.nq + model.nv)
         self._default = np.empty(size)
-        mujoco.mj_getState(model, self._workers[0].data, self._default, _FULL)
+        mujoco.mj_getState(model, self._placer.data, self._default, _FULL)
         self._default[0] = _CLOCK_START
         #: ``[N, nstate]`` MuJoCo's full physics state of every world: time, qpos, qvel and the rest.
         self.state = np.tile(self._default, (n_worlds, 1))
@@ -140,10 +149,11 @@ class BatchedPhysics:
         self.diverged = np.zeros(n_worlds, dtype=bool)
         #: Worlds that diverged since the start.
         self.n_diverged = 0
-        self.n_steps = 0
+        self._taken = np.zeros(n_worlds, dtype=np.int64)
         self._past_states = np.tile(self._default, (history, n_worlds, 1))
         self._past_ctrl = np.zeros((history, n_worlds, model.nu))
 
+        self._ctrl = np.zeros((n_worlds, model.nu))
         self._after = np.empty((n_worlds, size))
         self._warned = np.zeros(n_worlds, dtype=bool)
         self._poses = _Poses(
@@ -152,6 +162,11 @@ class BatchedPhysics:
             np.empty((n_worlds, len(self.body_ids), 3)),
         )
         self._stale = np.ones(n_worlds, dtype=bool)
+
+    @property
+    def n_steps(self) -> int:
+        """Control steps that every world has taken."""
+        return int(self._taken.min())
 
     @property
     def qpos(self) -> Array:
@@ -182,51 +197,76 @@ class BatchedPhysics:
         Raises:
             ValueError: another shape.
         """
-        if ctrl.shape != (self.n_worlds, self.model.nu):
-            raise ValueError(f"ctrl must be [{self.n_worlds}, {self.model.nu}], got {list(ctrl.shape)}")
-        slot = self.n_steps % len(self._past_states)
-        self._past_states[slot], self._past_ctrl[slot] = self.state, ctrl
-        after = self._step_all(ctrl)
-        due = self.state[:, 0] + self.substeps * self.model.opt.timestep
+        self._run(self._begin(ctrl, ALL, self.threads - 1))
+        return self.end_step()
+
+    def begin_step(self, ctrl: Array, worlds: slice = ALL) -> None:
+        """Have the threads take a control step of ``worlds``, a range of them; :meth:`end_step` waits for it.
+
+        Args:
+            ctrl: ``[n, nu]`` of these worlds, held over the substeps.
+            worlds: none of which is under way.
+
+        Raises:
+            ValueError: another shape.
+        """
+        self._begin(ctrl, worlds, self.threads)
+
+    def end_step(self, worlds: slice = ALL) -> NDArray[np.bool_]:
+        """Wait for what :meth:`begin_step` began; ``[n]`` which of these worlds diverged in it."""
+        first = worlds.indices(self.n_worlds)[0]
+        for task in self._begun.pop(first):
+            task.result()
+        before, after, ctrl = self.state[worlds], self._after[worlds], self._ctrl[worlds]
+        due = before[:, 0] + self.substeps * self.model.opt.timestep
         on_time = np.abs(after[:, 0] - due) < 0.5 * self.model.opt.timestep
-        sound = on_time & ~self._warned & self._sound(self.state) & self._sound(after) & np.isfinite(ctrl).all(-1)
-        self.diverged = ~sound
-        self._stale[:] = self.diverged
+        sound = on_time & ~self._warned[worlds] & self._sound(before) & self._sound(after) & np.isfinite(ctrl).all(-1)
+        self.diverged[worlds] = self._stale[worlds] = ~sound
         if sound.all():
-            self.state[:] = after
+            before[:] = after
         else:
-            self._recover(slot, after)
-        self.n_steps += 1
-        return self.diverged
+            before[sound] = after[sound]
+            self._recover(first + np.flatnonzero(~sound))
+        self._taken[worlds] += 1
+        return ~sound
 
-    def _step_all(self, ctrl: Array) -> Array:
-        """``[N, nstate]`` after the substeps; fills the poses and :attr:`_warned`."""
+    def _begin(self, ctrl: Array, worlds: slice, threads: int) -> Iterator[int]:
+        first, last, _ = worlds.indices(self.n_worlds)
+        if ctrl.shape != (last - first, self.model.nu):
+            raise ValueError(f"ctrl must be [{last - first}, {self.model.nu}], got {list(ctrl.shape)}")
+        slot = self._taken[first] % len(self._past_states)
+        self._past_states[slot, worlds], self._past_ctrl[slot, worlds] = self.state[worlds], ctrl
+        self._ctrl[worlds] = ctrl
         # One iterator for all threads: whoever is free takes the next world, so none waits longer than for one.
-        worlds = iter(range(self.n_worlds))
-        work = (self.state, ctrl, worlds, self._after, self._poses, self._warned)
-        others = [] if self._pool is None else [self._pool.submit(w.step, *work) for w in self._workers[1:]]
-        self._workers[0].step(*work)
-        for other in others:
-            other.result()
-        return self._after
+        numbers = iter(range(first, last))
+        self._begun[first] = [self._pool.submit(self._run, numbers) for _ in range(threads)]
+        return numbers
 
-    def body_state(self) -> dict[str, Array]:
-        """Fresh kinematics of all worlds, in new arrays.
+    def _run(self, worlds: Iterator[int]) -> None:
+        worker = self._idle.get()
+        try:
+            worker.step(self.state, self._ctrl, worlds, self._after, self._poses, self._warned)
+        finally:
+            self._idle.put(worker)
+
+    def body_state(self, worlds: slice = ALL) -> dict[str, Array]:
+        """Fresh kinematics of ``worlds``, in new arrays.
 
         Positions that a step leaves behind in ``MjData`` are one substep old; these belong to the present qpos.
 
         Returns:
-            ``qpos [N, nq]``, ``qvel [N, nv]``, ``xpos [N, B, 3]`` m, ``xquat [N, B, 4]``, ``com [N, 3]`` m.
+            ``qpos [n, nq]``, ``qvel [n, nv]``, ``xpos [n, B, 3]`` m, ``xquat [n, B, 4]``, ``com [n, 3]`` m.
         """
-        for i in np.flatnonzero(self._stale).tolist():
-            self._workers[0].pose(self.qpos[i], i, self._poses)
-        self._stale[:] = False
+        first = worlds.indices(self.n_worlds)[0]
+        for i in (first + np.flatnonzero(self._stale[worlds])).tolist():
+            self._placer.pose(self.qpos[i], i, self._poses)
+        self._stale[worlds] = False
         return {
-            "qpos": self.qpos.copy(),
-            "qvel": self.qvel.copy(),
-            "xpos": self._poses.xpos.copy(),
-            "xquat": self._poses.xquat.copy(),
-            "com": self._mass @ self._poses.xipos,
+            "qpos": self.qpos[worlds].copy(),
+            "qvel": self.qvel[worlds].copy(),
+            "xpos": self._poses.xpos[worlds].copy(),
+            "xquat": self._poses.xquat[worlds].copy(),
+            "com": self._mass @ self._poses.xipos[worlds],
         }
 
     def state_dict(self) -> dict[str, Array]:
@@ -243,14 +283,13 @@ class BatchedPhysics:
         if saved["state"].shape != self.state.shape:
             raise ValueError(f"state is {list(saved['state'].shape)}, this physics has {list(self.state.shape)}")
         self.state[:] = saved["state"]
-        self.n_steps, self.n_diverged = (int(c) for c in saved["counters"])
+        self._taken[:], self.n_diverged = (int(c) for c in saved["counters"])
         self._past_states[:], self._past_ctrl[:] = self.state, 0.0
         self._stale[:] = True
 
     def close(self) -> None:
         """Stop the threads."""
-        if self._pool is not None:
-            self._pool.shutdown()
+        self._pool.shutdown()
 
     def _sound(self, state: Array) -> NDArray[np.bool_]:
         finite = np.isfinite(state).all(-1)
@@ -258,27 +297,27 @@ class BatchedPhysics:
             slow = (np.abs(state[:, self._qvel]) < self._max_speed).all(-1)
         return np.logical_and(finite, slow)
 
-    def _recover(self, slot: int, after: Array) -> None:
-        """Record the diverged worlds and put them back at rest where they last were sound."""
-        bad = np.flatnonzero(self.diverged)
-        for i in bad:
-            self._dump(int(i), slot, after[i])
+    def _recover(self, bad: NDArray[np.integer]) -> None:
+        """Record worlds ``bad``, which diverged, and put them back at rest where they last were sound."""
+        for i in bad.tolist():
+            self._dump(i)
         self.n_diverged += len(bad)
-        last = np.where(self._sound(self.state)[:, None], self.state, self._default)
-        self.state[:] = np.where(self.diverged[:, None], last, after)
+        before = self.state[bad]
+        self.state[bad] = np.where(self._sound(before)[:, None], before, self._default)
         self.state[bad, self._qvel] = 0.0
         self.state[bad, 0] = _CLOCK_START
 
-    def _dump(self, world: int, slot: int, after: Array) -> None:
+    def _dump(self, world: int) -> None:
         if self._dump_dir is None or self._max_dumps < 1:
             return
         self._max_dumps -= 1
         self._dump_dir.mkdir(parents=True, exist_ok=True)
-        count = min(self.n_steps + 1, len(self._past_states))
-        order = (slot + 1 - count + np.arange(count)) % len(self._past_states)
-        states = np.concatenate([self._past_states[order, world], after[None]])
+        taken = int(self._taken[world])
+        count = min(taken + 1, len(self._past_states))
+        order = (taken + 1 - count + np.arange(count)) % len(self._past_states)
+        states = np.concatenate([self._past_states[order, world], self._after[world][None]])
         np.savez(
-            self._dump_dir / f"{self.n_steps:09d}_{world:05d}.npz",
+            self._dump_dir / f"{taken:09d}_{world:05d}.npz",
             state=states,
             qpos=states[:, self._qpos],
             qvel=states[:, self._qvel],

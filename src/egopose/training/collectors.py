@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import torch
@@ -15,6 +16,7 @@ from egopose.config import from_mapping
 from egopose.envs.transformed import TransformedEgoPoseEnv
 from egopose.errors import InputError
 from egopose.training.deferral import Completion, GaussianSampler, draws_gaussian
+from egopose.training.lanes import LaneCollector
 from egopose.training.workers import Workers, base_env, read_simulation, write_simulation
 
 __all__ = [
@@ -43,6 +45,8 @@ class CollectorSettings:
         workers: processes, each with an environment of its own.
         threads: torch threads while collecting; physics has threads of its own.
         update_threads: torch threads while the networks are updated.
+        lanes: parts of the worlds of ``sync`` that take turns, see :class:`egopose.training.lanes.LaneCollector`; 1 to
+            step all at once.
         address: of the Ray cluster, see :class:`egopose.training.workers.Workers`.
     """
 
@@ -52,6 +56,7 @@ class CollectorSettings:
     workers: int
     threads: int
     update_threads: int
+    lanes: int = 1
     address: str | None = None
 
     @classmethod
@@ -60,9 +65,11 @@ class CollectorSettings:
         settings = from_mapping(cls, values, source)
         if settings.kind not in KINDS:
             raise InputError(source, "kind", f"must be one of {', '.join(KINDS)}, not {settings.kind!r}")
-        for name in ("worlds", "physics_threads", "workers", "threads", "update_threads"):
+        for name in ("worlds", "physics_threads", "workers", "threads", "update_threads", "lanes"):
             if getattr(settings, name) < 1:
                 raise InputError(source, name, f"must be at least 1, not {getattr(settings, name)}")
+        if settings.lanes > settings.worlds:
+            raise InputError(source, "lanes", f"must be at most the worlds, {settings.worlds}, not {settings.lanes}")
         return settings
 
 
@@ -80,10 +87,13 @@ def build_collector(
     """
     if settings.kind == "sync":
         env = make_env(0)
+        acting = GaussianSampler(policy) if draws_gaussian(policy) else policy
+        collector: Callable[..., Collector] = Collector
         if isinstance(env, TransformedEgoPoseEnv):
             env.defer_rewards()
-        acting = GaussianSampler(policy) if draws_gaussian(policy) else policy
-        return Collector(
+            if isinstance(acting, GaussianSampler) and acting.draws_from_entries():
+                collector = partial(LaneCollector, lanes=settings.lanes)
+        return collector(
             env,
             acting,
             frames_per_batch=steps_per_iteration,

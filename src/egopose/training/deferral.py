@@ -2,9 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import MutableMapping
+from typing import Any
+
 import torch
 from tensordict import TensorDict, TensorDictBase
-from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBase
+from tensordict.nn import (
+    ProbabilisticTensorDictSequential,
+    TensorDictModule,
+    TensorDictModuleBase,
+    TensorDictSequential,
+)
 from torchrl.envs import EnvBase
 from torchrl.modules import IndependentNormal
 
@@ -24,6 +32,7 @@ class GaussianSampler(TensorDictModuleBase):
         super().__init__()
         self.actor = actor
         self._network = actor.module[:-1]
+        self._parts = [part for step in self._network for part in _parts(step)]
         self.in_keys = actor.in_keys
         self.out_keys = [key for key in actor.out_keys if key != "action_log_prob"]
 
@@ -32,6 +41,27 @@ class GaussianSampler(TensorDictModuleBase):
         for part in self._network:
             tensordict = part(tensordict)
         return tensordict.set("action", torch.normal(tensordict["loc"], tensordict["scale"]))
+
+    def draws_from_entries(self) -> bool:
+        """Whether :meth:`act` can stand for :meth:`forward`: every part reads and writes plain entries."""
+        return all(
+            type(part) is TensorDictModule and all(isinstance(key, str) for key in (*part.in_keys, *part.out_keys))
+            for part in self._parts
+        )
+
+    def act(self, entries: MutableMapping[Any, Any]) -> None:
+        """:meth:`forward` on a plain mapping, at a third of its expense."""
+        for part in self._parts:
+            out = part.module(*[entries[key] for key in part.in_keys])
+            entries.update(zip(part.out_keys, out if isinstance(out, tuple) else (out,), strict=True))
+        entries["action"] = torch.normal(entries["loc"], entries["scale"])
+
+
+def _parts(module: TensorDictModuleBase) -> list[TensorDictModuleBase]:
+    """The modules of a sequence in order, those of sequences inside it too."""
+    if isinstance(module, TensorDictSequential):
+        return [part for inner in module.module for part in _parts(inner)]
+    return [module]
 
 
 def draws_gaussian(policy: TensorDictModuleBase) -> bool:
