@@ -8,8 +8,6 @@ prepare_runtime()
 
 import logging  # noqa: E402
 import sys  # noqa: E402
-from collections.abc import Iterator  # noqa: E402
-from contextlib import contextmanager  # noqa: E402
 from pathlib import Path  # noqa: E402
 from typing import TYPE_CHECKING, Any  # noqa: E402
 
@@ -23,7 +21,6 @@ from egopose.errors import InputError  # noqa: E402
 
 if TYPE_CHECKING:
     from egopose.material import Material
-    from egopose.training.loop import BackgroundEvaluation, Evaluation, Run
 
 register_resolvers()
 
@@ -67,8 +64,7 @@ def run_training(
                 run.restore(checkpoint)
                 print(f"resuming {folder} after iteration {run.counters.iteration}", flush=True)
             loggers = build_loggers(config["logger"], folder, config, run.counters.iteration, run.counters.frames)
-            with _evaluation(run, material) as evaluation:
-                outcome = train(run, loggers, evaluation)
+            outcome = train(run, loggers, pipeline.build_evaluation(run, material))
         finally:
             run.collector.shutdown()
     except KeyboardInterrupt:
@@ -81,23 +77,6 @@ def run_training(
     figures = {"reason": outcome.reason, "iteration": outcome.iteration, "score": run.counters.score}
     mark_finished(folder, config, figures)
     return run.counters.score
-
-
-@contextmanager
-def _evaluation(run: Run, material: Material) -> Iterator[Evaluation | BackgroundEvaluation]:
-    """As ``training.evaluate_async`` says: between iterations, or beside them."""
-    from egopose.evaluators import BackgroundSurvival
-    from egopose.pipeline import build_evaluation
-
-    backend = run.config["training"].get("evaluate_async")
-    if backend is None or not run.settings.evaluate_every:
-        yield build_evaluation(run, material)
-        return
-    background = BackgroundSurvival(run, material, str(backend))
-    try:
-        yield background
-    finally:
-        background.close()
 
 
 def run_job(config: dict[str, Any], folder: Path, material: Material | None = None) -> float:
