@@ -29,15 +29,18 @@ from egopose.data.store import TakeStore
 from egopose.envs.mdp.observations import humanoid_state
 from egopose.errors import InputError
 from egopose.humanoid.model import HumanoidModel
+from egopose.models.blended import blended_regressor
+from egopose.models.kernel_regression import KernelRegression
 from egopose.models.mirror import state_mirror
 from egopose.models.regressor import StateRegressor
+from egopose.training.blending import KernelSettings, blend
 from egopose.training.checkpoint import CHECKSUMS, ComponentState, RunCheckpoint, metadata_of, read_json, verify
-from egopose.training.fragments import Span, cross_fit_blocks, without_block
+from egopose.training.fragments import Span, cross_fit_blocks, group_blocks, without_block
 from egopose.training.predictions import predict_takes
 from egopose.training.regressor_settings import RegressorSettings
 from egopose.training.supervised import Progress, State, TrainingResult, build_regressor, train_regressor
 from egopose.untrusted import read_json as read_json_file
-from egopose.vision.encoders import build_encoder
+from egopose.vision.encoders import FLOW_CHANNELS, build_encoder
 
 TABLE_KEYS = ("humanoid_state", "visual_context", "visual_features", "joint_targets")
 
@@ -45,6 +48,8 @@ TABLE_KEYS = ("humanoid_state", "visual_context", "visual_features", "joint_targ
 def regressor_name(config: Mapping[str, Any], store: TakeStore, flow_name: str) -> str:
     """``regressor-`` and a fingerprint of video, network, training, split and reference."""
     parts = [store.fingerprint, flow_name, config["vision"]["encoder"], config["regressor"], config["data"]["split"]]
+    if _by_subject(config):
+        parts.append("cross-fitted by subject")
     return "regressor-" + hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()[:12]
 
 
@@ -63,9 +68,16 @@ def regressor_tables(
     name = regressor_name(config, store, flow_name)
     weights = store.root / "regressors" / name
     if not _is_trained(store, name):
+        network = _network_config(config)
+        if network is not None:
+            _kernel_settings(config)  # what is wrong with it is said before a network is trained
+            regressor_tables(network, store, humanoid, flow_name)
         with store_lock(store.root):
             if not _is_trained(store, name):  # by the process this one waited for
-                _train(config, store, humanoid, flow_name, name, weights)
+                if network is None:
+                    _train(config, store, humanoid, flow_name, name, weights)
+                else:
+                    _blend(config, network, store, humanoid, flow_name, name)
     return store.table(name), weights
 
 
@@ -106,6 +118,19 @@ def kept_tables(
     return TensorDict(_predict(model, store, humanoid, flow_name, _settings(made_with)), [store.frames_total]), weights
 
 
+def _network_config(config: Mapping[str, Any]) -> dict[str, Any] | None:
+    """Of the F that a blended one is made of, which is an F of the store by itself; None where none is blended."""
+    regressor = config["regressor"]
+    if regressor.get("kernel") is None:
+        return None
+    return {**config, "regressor": {key: value for key, value in regressor.items() if key != "kernel"}}
+
+
+def _by_subject(config: Mapping[str, Any]) -> bool:
+    """Where people are held out for testing, they are for cross-fitting: whom F knows it knows far better."""
+    return config["data"]["split"]["kind"] == "subject" and int(config["regressor"]["cross_fit"]) > 1
+
+
 def _is_trained(store: TakeStore, name: str) -> bool:
     return store.has_table(name) and (store.root / "regressors" / name / "manifest.json").is_file()
 
@@ -122,8 +147,7 @@ def _weights_checksums(folder: Path) -> dict[str, str]:
 def _predict(
     model: StateRegressor, store: TakeStore, humanoid: HumanoidModel, flow_name: str, settings: RegressorSettings
 ) -> dict[str, Tensor]:
-    whole = [Span(t.offset, t.offset + t.length) for t in store.takes]
-    tables = predict_takes(model, store.flow(flow_name), whole, settings)
+    tables = predict_takes(model, store.flow(flow_name), _whole_takes(store), settings)
     return _with_targets(model, tables, humanoid, settings)
 
 
@@ -144,8 +168,7 @@ def _train(
     settings = _settings(config)
     flow = store.flow(flow_name)
     states = humanoid_state(store.reference).float()
-    pieces = split_takes(store.takes, config["data"]["split"], "train", supported_only=False)
-    fragments = [Span(*span) for span in global_spans(store, pieces)]
+    fragments = _training_spans(config, store)
     mirror = state_mirror(humanoid.skeleton) if settings.mirror else None
     weights.parent.mkdir(parents=True, exist_ok=True)
     parts: list[Path] = []
@@ -166,7 +189,7 @@ def _train(
     model, result = fit(fragments, "")
     tables = _predict(model, store, humanoid, flow_name, settings)
     if settings.cross_fit > 1:
-        for number, block in enumerate(cross_fit_blocks(fragments, settings.cross_fit)):
+        for number, block in enumerate(_blocks(config, store)):
             others = without_block(fragments, block, settings.margin, settings.margin)
             seen = _predict(fit(others, f".fold{number}")[0], store, humanoid, flow_name, settings)
             for key in ("humanoid_state", "visual_features", "joint_targets"):
@@ -180,14 +203,82 @@ def _train(
     }
     card = {"flow": flow_name, "best_epoch": result.best_epoch, **errors}
     sizes = {"state_size": states.shape[1], "vision": config["vision"], "regressor": config["regressor"]}
-    # Never weights beside a table that others made.
-    shutil.rmtree(store.root / "tables" / name, ignore_errors=True)
-    RunCheckpoint({"regressor": model, "config": sizes}).save(
-        weights, metadata=metadata_of("regressor", states.shape[1], result.best_epoch, 0, 0.0)
-    )
-    store.write_table(name, tables, card)
+    _keep(store, name, model, tables, sizes, card)
     for part in parts:
         shutil.rmtree(part, ignore_errors=True)
+
+
+def _keep(
+    store: TakeStore,
+    name: str,
+    model: StateRegressor,
+    tables: dict[str, Tensor],
+    sizes: dict[str, Any],
+    card: dict[str, Any],
+) -> None:
+    """Weights and table. Never weights beside a table that others made."""
+    shutil.rmtree(store.root / "tables" / name, ignore_errors=True)
+    RunCheckpoint({"regressor": model, "config": sizes}).save(
+        store.root / "regressors" / name,
+        metadata=metadata_of("regressor", sizes["state_size"], card["best_epoch"], 0, 0.0),
+    )
+    store.write_table(name, tables, card)
+
+
+def _whole_takes(store: TakeStore) -> list[Span]:
+    return [Span(t.offset, t.offset + t.length) for t in store.takes]
+
+
+def _training_spans(config: Mapping[str, Any], store: TakeStore) -> list[Span]:
+    pieces = split_takes(store.takes, config["data"]["split"], "train", supported_only=False)
+    return [Span(*span) for span in global_spans(store, pieces)]
+
+
+def _blocks(config: Mapping[str, Any], store: TakeStore) -> list[list[Span]]:
+    """The training frames in as many lists as there are cross-fits."""
+    folds = _settings(config).cross_fit
+    pieces = split_takes(store.takes, config["data"]["split"], "train", supported_only=False)
+    fragments = _training_spans(config, store)
+    subjects = [store.takes[piece.take].subject for piece in pieces]
+    if _by_subject(config) and len(set(subjects)) > 1:
+        return group_blocks(fragments, subjects, folds)
+    return cross_fit_blocks(fragments, folds)
+
+
+def _blend(
+    config: Mapping[str, Any],
+    network_config: Mapping[str, Any],
+    store: TakeStore,
+    humanoid: HumanoidModel,
+    flow_name: str,
+    name: str,
+) -> None:
+    """From a cross-fitted F of the store to a blended one, its tables cross-fitted likewise."""
+    settings = _settings(config)
+    network_name = regressor_name(network_config, store, flow_name)
+    network, made_with = load_regressor(store.root / "regressors" / network_name)
+    print(f"blending a kernel regression with {network_name}", file=sys.stderr, flush=True)
+    blended = blend(
+        network,
+        store.table(network_name)["humanoid_state"],
+        store.flow(flow_name),
+        humanoid_state(store.reference),
+        _whole_takes(store),
+        _training_spans(config, store),
+        _blocks(config, store),
+        humanoid,
+        settings,
+        _kernel_settings(config),
+    )
+    print(f"shares of network and kernel: {blended.shares}", file=sys.stderr, flush=True)
+    tables = _predict(blended.model, store, humanoid, flow_name, settings)
+    for span in _training_spans(config, store):
+        tables["humanoid_state"][span.start : span.stop] = blended.crossed[span.start : span.stop]
+    tables = _with_targets(blended.model, tables, humanoid, settings)
+    centres, axes = blended.kernel.centres.shape
+    sizes = {**made_with, "regressor": config["regressor"], "centres": centres, "axes": axes}
+    card = {**store.table_card(network_name), "shares": blended.shares, "centres": centres}
+    _keep(store, name, blended.model, tables, sizes, card)
 
 
 def _save_part(part: Path, state: State) -> None:
@@ -207,7 +298,14 @@ def _load_part(part: Path) -> State | None:
 
 
 def _settings(config: Mapping[str, Any]) -> RegressorSettings:
-    return from_mapping(RegressorSettings, config["regressor"], "conf/regressor")
+    own = _network_config(config) or config
+    return from_mapping(RegressorSettings, own["regressor"], "conf/regressor")
+
+
+def _kernel_settings(config: Mapping[str, Any]) -> KernelSettings:
+    if _settings(config).cross_fit < 2:
+        raise InputError("regressor", "cross_fit", "must be at least 2 where a kernel is blended in")
+    return from_mapping(KernelSettings, config["regressor"]["kernel"], "conf/regressor kernel")
 
 
 def load_regressor(weights: str | Path) -> tuple[StateRegressor, dict[str, Any]]:
@@ -228,6 +326,12 @@ def load_regressor(weights: str | Path) -> tuple[StateRegressor, dict[str, Any]]
     settings = _settings(config)
     # The statistics come with the weights; two frames of zeros stand in for the frames they were taken from.
     model = build_regressor(encoder, torch.zeros(2, size), [Span(0, 2)], settings, encoder.features)
+    if _network_config(config) is not None:
+        kernel = _kernel_settings(config)
+        windows = kernel.windows()
+        inputs = windows.count * FLOW_CHANNELS * kernel.cells**2
+        blank = KernelRegression(inputs, int(config["axes"]), int(config["centres"]), size)
+        model = blended_regressor(model, blank, kernel.cells, windows)
     RunCheckpoint({"regressor": model}).restore(folder)
     return model.eval(), config
 

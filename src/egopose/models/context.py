@@ -9,7 +9,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-LstmState = tuple[Tensor, Tensor]
+LstmState = tuple[Tensor, ...]
 
 
 def reverse_in_time(sequence: Tensor, lengths: Tensor | None = None) -> Tensor:

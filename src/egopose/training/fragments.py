@@ -91,3 +91,26 @@ def training_windows(fragments: Sequence[Span], length: int, margin: int, genera
             windows.append(Window(max(a - margin, begin), min(b + margin, end), a, b))
     order = torch.randperm(len(windows), generator=generator)
     return [windows[i] for i in order.tolist()]
+
+
+def group_blocks(fragments: Sequence[Span], groups: Sequence[object], folds: int) -> list[list[Span]]:
+    """At most ``folds`` lists of whole fragments that together are ``fragments``, no group in two of them.
+
+    The largest groups are dealt first, each to the list with the fewest frames.
+
+    Args:
+        fragments: stretches.
+        groups: of each fragment, whatever must stay together: a person.
+        folds: lists wanted; there are no more than groups.
+    """
+    members: dict[object, list[Span]] = {}
+    for fragment, group in zip(fragments, groups, strict=True):
+        members.setdefault(group, []).append(fragment)
+
+    def frames(spans: Sequence[Span]) -> int:
+        return sum(span.stop - span.start for span in spans)
+
+    blocks: list[list[Span]] = [[] for _ in range(min(folds, len(members)))]
+    for spans in sorted(members.values(), key=frames, reverse=True):
+        min(blocks, key=frames).extend(spans)
+    return blocks

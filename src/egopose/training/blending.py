@@ -1,0 +1,224 @@
+"""A blended F from a trained one: the kernel regression on the training frames, and how far each of the two is trusted.
+
+The shares are chosen on cross-fitted predictions, in which no answer comes from a fit that saw its frame. There are few
+of them (two for the root, two for the legs, two for the rest of the body): corrections with more numbers did worse on
+frames that were not used to choose them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from egopose.errors import InputError
+from egopose.humanoid.model import HumanoidModel
+from egopose.models.blended import TimeWindows, blended_regressor, flow_cells
+from egopose.models.kernel_regression import KernelRegression, fit_kernel_regression
+from egopose.models.regressor import StateRegressor
+from egopose.training.fragments import Span, without_block
+from egopose.training.predictions import Flow, take_frames, torch_threads
+from egopose.training.regressor_settings import RegressorSettings
+
+
+@dataclass(frozen=True)
+class KernelSettings:
+    """``conf/regressor``'s ``kernel``; each file gives every value and its source.
+
+    Args:
+        cells: a side of the picture is divided into so many.
+        reach, step, width: frames; see :class:`TimeWindows`.
+        axes, whitening, ridge, length: see :func:`fit_kernel_regression`.
+        centres: moments of training remembered at most, evenly chosen.
+        share_step: the shares are multiples of it.
+    """
+
+    cells: int
+    reach: int
+    step: int
+    width: float
+    axes: int
+    whitening: float
+    ridge: float
+    length: float
+    centres: int
+    share_step: float
+
+    def __post_init__(self) -> None:
+        def check(ok: bool, name: str, cause: str) -> None:
+            if not ok:
+                raise InputError("regressor.kernel", name, cause)
+
+        check(min(self.cells, self.axes) > 0, "cells", "must be positive, as must axes")
+        check(self.step > 0 and self.reach >= 0 and self.reach % self.step == 0, "step", "must divide reach")
+        check(self.width > 0 and self.ridge > 0 and self.length > 0, "width", "must be positive, as must ridge, length")
+        check(self.centres >= 2, "centres", "must be at least 2")
+        check(0 < self.share_step <= 1, "share_step", "must lie in (0, 1]")
+
+    def windows(self) -> TimeWindows:
+        return TimeWindows(self.reach, self.step, self.width)
+
+
+@dataclass(frozen=True)
+class Blend:
+    """What :func:`blend` makes.
+
+    Attributes:
+        model: the blended F.
+        kernel: its kernel regression.
+        crossed: ``[F, S]`` states z on the training frames from fits that never saw them, blended by the same shares;
+            elsewhere without meaning.
+        shares: of network and kernel, by part of the body.
+    """
+
+    model: StateRegressor
+    kernel: KernelRegression
+    crossed: Tensor
+    shares: dict[str, tuple[float, float]]
+
+
+@torch.no_grad()
+def blend(
+    network: StateRegressor,
+    crossed_states: Tensor,
+    flow: Flow,
+    states: Tensor,
+    takes: Sequence[Span],
+    fragments: Sequence[Span],
+    blocks: Sequence[Sequence[Span]],
+    humanoid: HumanoidModel,
+    settings: RegressorSettings,
+    kernel_settings: KernelSettings,
+) -> Blend:
+    """A blended F.
+
+    Args:
+        network: trained on all ``fragments``; its parts become those of the answer.
+        crossed_states: ``[F, S]`` states z, on the training frames by networks that never saw them.
+        flow: of the whole store.
+        states: ``[F, S]`` the true ones.
+        takes: each a clip by itself.
+        fragments: training frames.
+        blocks: which of them are left out together, as ``crossed_states`` were.
+        humanoid: whose states they are.
+        settings: of F.
+        kernel_settings: of the kernel and the shares.
+    """
+    with torch_threads(settings.threads):
+        seen = window_table(flow, takes, kernel_settings, settings.encode_batch)
+        wanted, by_network = network.normalise(states), network.normalise(crossed_states)
+        by_kernel = torch.zeros_like(wanted)
+        for block in blocks:
+            others = without_block(fragments, block, settings.margin, settings.margin)
+            left_out = fit_kernel(seen, wanted, others, kernel_settings)
+            for span in block:
+                by_kernel[span.start : span.stop] = left_out(seen[span.start : span.stop])
+        kernel = fit_kernel(seen, wanted, fragments, kernel_settings)
+    model = blended_regressor(network, kernel, kernel_settings.cells, kernel_settings.windows())
+    frames = torch.cat([torch.arange(s.start, s.stop) for s in fragments])
+    starts = torch.tensor([span.start for span in takes])
+    take = torch.searchsorted(starts, frames, right=True) - 1
+    chosen = {}
+    for part, (members, judged, unit) in share_groups(humanoid, model.state_std).items():
+        first, second, truth = ((rows[frames][:, judged] * unit) for rows in (by_network, by_kernel, wanted))
+        chosen[part] = choose_shares(first, second, truth, take, kernel_settings.share_step)
+        model.head.network_share[members], model.head.kernel_share[members] = chosen[part]
+    crossed = model.head.network_share * by_network + model.head.kernel_share * by_kernel
+    return Blend(model, kernel, crossed * model.state_std + model.state_mean, chosen)
+
+
+@torch.no_grad()
+def window_table(flow: Flow, takes: Sequence[Span], settings: KernelSettings, batch: int) -> Tensor:
+    """What the kernel sees of each frame, ``[F, V]`` float32; zero outside of ``takes``.
+
+    Args:
+        flow: ``[F, 2, S, S]`` of the whole store.
+        takes: each a clip by itself.
+        settings: of the cells and windows.
+        batch: frames read at a time.
+    """
+    windows = settings.windows()
+    rows = torch.zeros(len(flow), 0)
+    for span in takes:
+        parts = [np.arange(at, min(at + batch, span.stop)) for at in range(span.start, span.stop, batch)]
+        cells = torch.cat([flow_cells(take_frames(flow, part), settings.cells) for part in parts])
+        seen = windows(windows.pad(cells[None]))[0]
+        if not rows.shape[1]:
+            rows = torch.zeros(len(flow), seen.shape[1])
+        rows[span.start : span.stop] = seen
+    return rows
+
+
+def fit_kernel(table: Tensor, wanted: Tensor, spans: Sequence[Span], settings: KernelSettings) -> KernelRegression:
+    """The kernel regression learned on ``spans``.
+
+    Args:
+        table: ``[F, V]`` of :func:`window_table`.
+        wanted: ``[F, S]`` states in normalised units.
+        spans: training frames.
+        settings: of the kernel.
+    """
+    frames = torch.cat([torch.arange(s.start, s.stop) for s in spans])
+    if len(frames) > settings.centres:
+        frames = frames[torch.linspace(0, len(frames) - 1, settings.centres).round().long()]
+    return fit_kernel_regression(
+        table[frames],
+        wanted[frames],
+        axes=settings.axes,
+        whitening=settings.whitening,
+        ridge=settings.ridge,
+        length=settings.length,
+    )
+
+
+def share_groups(humanoid: HumanoidModel, state_std: Tensor) -> dict[str, tuple[Tensor, Tensor, Tensor]]:
+    """Root, legs and the rest of the body: columns of z that share, columns that are judged, and the latter's units.
+
+    Angles are judged in rad, hands left out, as E_pose has it; the root's eleven numbers in normalised units. A joint's
+    velocity goes with its angle.
+
+    Args:
+        humanoid: whose state z is.
+        state_std: ``[S]``.
+    """
+    skeleton = humanoid.skeleton
+    below: set[int] = set()
+    for foot in humanoid.feet.tolist():
+        while foot > 0:
+            below.add(foot)
+            foot = int(skeleton.parents[foot])
+    owner = [index for index, joint in enumerate(skeleton.joints) for _ in joint.dofs]
+    leg = torch.tensor([index in below for index in owner])
+    dofs, hands = torch.arange(len(owner)), set(humanoid.hand_dofs.tolist())
+    velocities = 11 + len(owner)
+    root = torch.cat([torch.arange(5), torch.arange(5 + len(owner), velocities)])
+    groups = {"root": (root, root, torch.ones(len(root)))}
+    for part, members in (("legs", dofs[leg]), ("upper_body", dofs[~leg])):
+        judged = 5 + torch.tensor([d for d in members.tolist() if d not in hands])
+        groups[part] = (torch.cat([5 + members, velocities + members]), judged, state_std[judged])
+    return groups
+
+
+def choose_shares(network: Tensor, kernel: Tensor, wanted: Tensor, take: Tensor, step: float) -> tuple[float, float]:
+    """Shares of network and kernel whose mean distance to the truth is least; they are at most 1 together.
+
+    Args:
+        network: ``[N, J]`` cross-fitted predictions less the training mean.
+        kernel: ``[N, J]`` likewise.
+        wanted: ``[N, J]`` the truth less the training mean.
+        take: ``[N]`` int64; each take counts alike, as in the metrics.
+        step: of the grid.
+    """
+    weight = 1.0 / torch.bincount(take)[take].double()
+    levels = round(1 / step)
+    best, chosen = float("inf"), (0.0, 0.0)
+    for first in range(levels + 1):
+        for second in range(levels + 1 - first):
+            a, b = first / levels, second / levels
+            error = float(((a * network + b * kernel - wanted).norm(dim=1).double() * weight).sum())
+            if error < best:
+                best, chosen = error, (a, b)
+    return chosen
