@@ -11,6 +11,7 @@ import torch
 from env_stand_in import environment
 from torchrl.collectors import Collector
 
+from egopose import runtime
 from egopose.envs.benchmark import RawReplay, StepRecorder, compare_with_raw
 
 
@@ -66,3 +67,21 @@ def test_the_runtime_is_prepared_before_torch() -> None:
         "assert 'torch' not in sys.modules; assert os.environ['OMP_WAIT_POLICY'] == 'PASSIVE'"
     )
     subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_quick_products_keep_single_precision() -> None:
+    """As numpy's double precision says, whichever library multiplies."""
+    code = (
+        "import torch; from egopose.runtime import prefer_quick_products; quick = prefer_quick_products();"
+        "setting = torch.backends.mkldnn.matmul.fp32_precision; assert (setting == 'bf16') == quick, setting;"
+        "a, b = torch.randn(500, 700), torch.randn(700, 300); exact = a.double().numpy() @ b.double().numpy();"
+        "error = abs((a @ b).numpy() - exact).max(); assert error < 1e-4, error"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_products_of_fewer_digits_are_left_off(monkeypatch) -> None:
+    before = torch.backends.mkldnn.matmul.fp32_precision
+    monkeypatch.setattr(runtime, "_keeps_single_precision", lambda *sizes: False)
+    assert not runtime.prefer_quick_products.__wrapped__()
+    assert torch.backends.mkldnn.matmul.fp32_precision == before

@@ -15,6 +15,7 @@ from torchrl.envs import EnvBase
 from egopose.config import from_mapping
 from egopose.envs.transformed import TransformedEgoPoseEnv
 from egopose.errors import InputError
+from egopose.runtime import prefer_quick_products
 from egopose.training.deferral import Completion, GaussianSampler, draws_gaussian
 from egopose.training.lanes import LaneCollector
 from egopose.training.workers import Workers, base_env, read_simulation, write_simulation
@@ -85,6 +86,7 @@ def build_collector(
 
     ``track_traj_ids=False`` and ``device=None`` because they are the quickest (measured; see docs/howto-bench.md).
     """
+    prefer_quick_products()
     if settings.kind == "sync":
         env = make_env(0)
         acting = GaussianSampler(policy) if draws_gaussian(policy) else policy

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from egopose.models.regressor import StateRegressor
+from egopose.runtime import prefer_quick_products
 from egopose.training.fragments import Span
 from egopose.training.regressor_settings import RegressorSettings
 
@@ -26,7 +27,8 @@ def take_frames(flow: Flow, frames: np.ndarray) -> Tensor:
 
 @contextmanager
 def torch_threads(count: int) -> Iterator[None]:
-    """``count`` threads for torch inside, what it was before after."""
+    """``count`` threads for torch inside, what it was before after; quick products from here on."""
+    prefer_quick_products()
     before = torch.get_num_threads()
     torch.set_num_threads(count)
     try:

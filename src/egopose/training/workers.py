@@ -19,6 +19,7 @@ from torchrl.collectors import Collector, MultiAsyncCollector, MultiSyncCollecto
 from torchrl.envs import EnvBase, TransformedEnv
 
 from egopose.errors import InputError
+from egopose.runtime import prefer_quick_products
 from egopose.training.moments import merge_states, without_counts
 
 State = dict[str, Any]
@@ -218,6 +219,7 @@ class Workers:
 
 
 def _seeded(make_env: Callable[[int], EnvBase], seed: int, number: int) -> EnvBase:
+    prefer_quick_products()
     torch.manual_seed((seed * 1000 + 1 + number) % 2**63)
     return make_env(number)
 
