@@ -2,6 +2,7 @@
 
 Sources: a motion file, a folder of an estimate, an evaluation's folder or a run directory; several are compared.
 Or `ws://127.0.0.1:8765/json`: what `egopose stream` sends, live.
+Words key=value are overrides of conf/sync.yaml (the camera), for `--offset auto` and the viewer's button Find.
 """
 
 from __future__ import annotations
@@ -26,6 +27,18 @@ if TYPE_CHECKING:
     from egopose.viewer.live import LiveViewer
 
 
+_LIVE = ("ws://", "wss://")
+
+
+def _offset(word: str) -> float | None:
+    """Seconds; None for one that is to be found."""
+    return None if word == "auto" else float(word)
+
+
+def _is_source(word: str) -> bool:
+    return word.startswith(_LIVE) or Path(word).exists()
+
+
 def main(arguments: Sequence[str] | None = None) -> None:
     """Command line; serves until it is interrupted."""
     parser = argparse.ArgumentParser(
@@ -33,7 +46,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     )
     parser.add_argument("sources", nargs="+", metavar="RUN_OR_MOTION")
     parser.add_argument("--video", type=Path, help="the wearer's MP4, of a source that is one motion")
-    parser.add_argument("--offset", type=float, default=0.0, help="seconds: the motion's time 0 in the video")
+    parser.add_argument(
+        "--offset", type=_offset, default=0.0, metavar="S", help="the motion's time 0 in the video; `auto` finds it"
+    )
     parser.add_argument("--address", default="127.0.0.1", help="to listen at; any but this machine's own needs a token")
     parser.add_argument("--port", type=int, default=8080, help="0 for a free one")
     parser.add_argument("--token", help="16 letters and digits at least; `new` makes one and prints it")
@@ -45,17 +60,27 @@ def main(arguments: Sequence[str] | None = None) -> None:
         from egopose.viewer.clip import Footage
         from egopose.viewer.door import Address
         from egopose.viewer.sources import read_runs
+        from egopose.vision.video import probe_video
 
+        overrides = [word for word in options.sources if "=" in word and not _is_source(word)]
+        sources = [word for word in options.sources if word not in overrides]
+        if not sources:
+            raise InputError("view", "source", "none is named: a motion file, an evaluation, a run or ws:// address")
         token = secrets.token_hex(16) if options.token == "new" else options.token
         address = Address(options.address, options.port, token)
-        footage = None if options.video is None else Footage(options.video, options.offset)
+        find_sync = options.offset is None
+        footage = None if options.video is None else Footage(options.video, options.offset or 0.0)
         viewer: Viewer | LiveViewer
-        if options.sources[0].startswith(("ws://", "wss://")):
+        if sources[0].startswith(_LIVE):
             from egopose.viewer.live import LiveViewer
 
-            viewer = LiveViewer(options.sources[0], address)
+            if len(sources) > 1:
+                raise InputError("view", "source", "a live stream is shown by itself; name nothing beside it")
+            viewer = LiveViewer(sources[0], address)
         else:
-            viewer = Viewer(read_runs(options.sources, footage), address)
+            if footage is not None:
+                probe_video(footage.path)
+            viewer = Viewer(read_runs(sources, footage), address, find_sync, overrides)
     except InputError as error:
         print(f"error: {error}", file=sys.stderr)
         raise SystemExit(2) from None

@@ -5,23 +5,26 @@ from __future__ import annotations
 import queue
 import threading
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
 import numpy as np
 
-from egopose.viewer.clip import Clip, Run
+from egopose.viewer.clip import Clip, Footage, Run
 from egopose.viewer.curves import Chart
 from egopose.viewer.door import Address
 from egopose.viewer.figure import Color, Figure
 from egopose.viewer.player import Player
 from egopose.viewer.serving import furnish, open_server
+from egopose.viewer.sync_panel import SyncPanel
 from egopose.viewer.wearer import Pictures
 
 _MAIN: Color = (70, 110, 220)
 _OTHER: Color = (235, 140, 40)
 _REFERENCE: Color = (60, 190, 90)
-_STEPS = ((12, 0.34), (24, 0.22), (45, 0.12))  # frames ahead and opacity: a forecast's poses to come
+_DRAWN: Color = (170, 80, 200)
+_STEPS = ((12, 0.4), (24, 0.26), (45, 0.15))  # frames ahead and opacity: a forecast's poses to come
 _NONE = "none"
 _TICK, _CHARTS_EVERY = 1 / 30, 3  # s between pictures; charts and slider follow at a third of that
 _SPEEDS = ("0.1", "0.25", "0.5", "1", "2", "4")
@@ -33,12 +36,16 @@ class Viewer:
     Args:
         runs: at least one; the first is shown first.
         address: where browsers come in.
+        find_sync: look for the sync offset of the first clip's video at once.
+        overrides: of ``conf/sync.yaml``, for the search.
 
     Raises:
-        InputError: the address cannot be listened at.
+        InputError: the address cannot be listened at, or a setting is wrong.
     """
 
-    def __init__(self, runs: Sequence[Run], address: Address) -> None:
+    def __init__(
+        self, runs: Sequence[Run], address: Address, find_sync: bool = False, overrides: Sequence[str] = ()
+    ) -> None:
         self._runs = {run.label: run for run in runs}
         self._server, self._door, self.url = open_server(address)
         self._player = Player()
@@ -46,9 +53,11 @@ class Viewer:
         self._figures: dict[str, Figure] = {}
         self._trail: list[tuple[Figure, int]] = []
         self._pictures: Pictures | None = None
-        self._build()
+        self._build(overrides)
         # Here and not on the thread: the first figure reads conf/humanoid, and Hydra composes for one thread at a time.
         self._load()
+        if find_sync:
+            self._sync.find()
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._loop, daemon=True)
         self._thread.start()
@@ -62,7 +71,7 @@ class Viewer:
         self._door.close()
         self._server.stop()
 
-    def _build(self) -> None:
+    def _build(self, overrides: Sequence[str]) -> None:
         gui = self._server.gui
         self._world = furnish(self._server)
         labels = list(self._runs)
@@ -75,6 +84,7 @@ class Viewer:
         self._speed = gui.add_dropdown("Speed", _SPEEDS, initial_value="1")
         self._status = gui.add_markdown("")
         self._video = gui.add_image(np.zeros((2, 2, 3), np.uint8), label="Wearer's video", visible=False)
+        self._sync = SyncPanel(gui, self._asked.put, self._move_video, overrides)
         self._value = Chart(gui, "Value V(s)")
         self._confidence = Chart(gui, "Fail-safe: confidence, resets")
         self._errors = gui.add_dropdown("Figure", [_NONE], initial_value=_NONE, visible=False)
@@ -147,8 +157,6 @@ class Viewer:
         """Put the chosen clips into the scene, from their first frame on."""
         for figure in (*self._figures.values(), *(f for f, _ in self._trail)):
             figure.remove()
-        if self._pictures is not None:
-            self._pictures.close()
         clips, scene = self._clips(), self._server.scene
         _, main, _ = clips[0]
         self._figures = {
@@ -158,18 +166,31 @@ class Viewer:
         if main.reference is not None:
             self._figures["reference"] = Figure(scene, "/world/reference", main.reference, _REFERENCE, 0.35)
         for k, future in enumerate(main.futures):
-            self._figures[f"future {k}"] = Figure(scene, f"/world/future{k}", future, _MAIN, 0.2)
+            self._figures[f"future {k}"] = Figure(scene, f"/world/future{k}", future, _DRAWN, 0.3)
         steps = _STEPS if main.forecast else ()
         self._trail = [
             (Figure(scene, f"/world/ahead{ahead}", main.motion, _MAIN, opacity), ahead) for ahead, opacity in steps
         ]
-        self._pictures = None
-        if main.footage is not None:
-            self._pictures = Pictures(main.footage, main.motion.fps, len(main.motion))
+        self._show_video(main, main.footage)
+        self._sync.load(main)
         self._player.load(len(main.motion), main.motion.fps)
         self._frame.value = 0
         self._frame.max = max(1, len(main.motion) - 1)
         self._charts(clips)
+
+    def _show_video(self, clip: Clip, footage: Footage | None) -> None:
+        if self._pictures is not None:
+            self._pictures.close()
+        self._pictures = None if footage is None else Pictures(footage, clip.motion.fps, len(clip.motion))
+        said = ["rendered"] if footage is not None and footage.rendered else []
+        said += ["not seen by the forecast"] if clip.forecast else []
+        self._video.label = "Wearer's video" + (f" ({', '.join(said)})" if said else "")
+
+    def _move_video(self, offset: float) -> None:
+        """To another sync offset; the body stays at its frame."""
+        clip = self._clips()[0][1]
+        if clip.footage is not None:
+            self._show_video(clip, replace(clip.footage, offset=offset))
 
     def _charts(self, clips: Sequence[tuple[str, Clip, Color]]) -> None:
         fps = clips[0][1].motion.fps
@@ -229,14 +250,15 @@ class Viewer:
         self._frame.value = frame
         self._play.label = "Pause" if self._player.playing else "Play"
         self._status.content = self._line(frame, clips)
-        for chart in (self._value, self._confidence, self._error, self._angle):
-            chart.at(frame)
+        for marked in (self._value, self._confidence, self._error, self._angle, self._sync):
+            marked.at(frame)
 
     def _line(self, frame: int, clips: Sequence[tuple[str, Clip, Color]]) -> str:
         motion = clips[0][1].motion
         parts = [f"frame {frame} of {len(motion)}, {frame / motion.fps:.2f} s", f"blue: {clips[0][0]}"]
         parts += [f"orange: {label}" for label, _, _ in clips[1:]]
         parts += ["green: reference"] if "reference" in self._figures else []
+        parts += ["violet: other futures drawn"] if clips[0][1].futures else []
         parts += [f"video: {self._pictures.fault}"] if self._pictures is not None and self._pictures.fault else []
         return "; ".join(parts)
 

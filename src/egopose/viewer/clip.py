@@ -12,14 +12,23 @@ from egopose.motion.rotations import Array
 
 @dataclass(frozen=True)
 class Footage:
-    """A video in step with a clip: the clip's time t is the video's ``t + offset`` seconds.
+    """A video in step with a clip: the clip's time t is the video's ``t + start + offset`` seconds.
 
-    ``last_panel``: the wearer's view is the last square of a side-by-side picture.
+    Args:
+        path: an MP4.
+        offset: s, the sync offset of the take.
+        start: s, where in the take the clip begins.
+        last_panel: the wearer's view is the last square of a side-by-side picture.
+        rendered: it was rendered from motion, not filmed.
+        taken_at: rate of filming where the file's stamps are not of it.
     """
 
     path: Path
     offset: float = 0.0
+    start: float = 0.0
     last_panel: bool = False
+    rendered: bool = False
+    taken_at: float | None = None
 
 
 @dataclass(frozen=True, eq=False)

@@ -142,6 +142,8 @@ class Door:
                 inner_writer.close()
         except (TimeoutError, OSError, ValueError, asyncio.IncompleteReadError, asyncio.LimitOverrunError):
             return  # whoever knocked went away, or spoke no HTTP
+        except asyncio.CancelledError:
+            return  # the door closes; asyncio would print a traceback for each browser that is still there
         finally:
             writer.close()
 

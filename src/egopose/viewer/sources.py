@@ -9,10 +9,13 @@ from pathlib import Path
 
 import numpy as np
 
+from egopose.data.prepare_motion import without_lead_in
 from egopose.errors import InputError
+from egopose.evaluation.report import FOOTAGE
 from egopose.motion.io import read_motion
 from egopose.motion.motion import Motion
 from egopose.motion.rotations import Array
+from egopose.untrusted import read_json
 from egopose.viewer.clip import Clip, Footage, Run
 
 _MAX_TABLE_BYTES = 64 * 2**20
@@ -33,7 +36,9 @@ def read_run(path: str | Path, footage: Footage | None = None) -> Run:
     if not path.exists():
         raise InputError(path, "path", "no such file or folder")
     if path.is_file():
-        clips = {path.stem: Clip(read_motion(path))}
+        # With a video its time 0 is the one that preparing and `egopose sync` count from.
+        motion = read_motion(path)
+        clips = {path.stem: Clip(motion if footage is None else without_lead_in(motion))}
     elif (path / "estimate.npz").is_file() or (path / "forecast.npz").is_file():
         clips = {path.name: _read_folder(path)}
     else:
@@ -81,11 +86,31 @@ def _read_folder(folder: Path) -> Clip:
         degree, _, edge = name.rpartition("_")
         bands.setdefault(degree, {})[edge] = values
     bands = {d: b for d, b in bands.items() if set(b) == {"low", "median", "high"}}
-    video = folder / "side_by_side.mp4"
-    footage = Footage(video, last_panel=True) if video.is_file() else None
+    footage = _read_footage(folder)
     for other in (*futures, *([reference] if reference else [])):
         _check_length(folder, motion, other)
     return Clip(motion, reference, futures, forecast, curves, bands, footage)
+
+
+def _read_footage(folder: Path) -> Footage | None:
+    """The video that ``wearer.json`` names, else the last panel of ``side_by_side.mp4``; None where neither is there.
+
+    Raises:
+        InputError: ``wearer.json`` is damaged.
+    """
+    record, panels = folder / FOOTAGE, folder / "side_by_side.mp4"
+    if record.is_file():
+        found = read_json(record, "footage")
+        try:
+            path, rate = Path(str(found["video"])), found["taken_at"]
+            offset, start = float(found["sync_offset"]), float(found["start"])
+            rate = None if rate is None else float(rate)
+            footage = Footage(path, offset, start, rendered=bool(found["rendered"]), taken_at=rate)
+        except (KeyError, TypeError, ValueError) as error:
+            raise InputError(record, "footage", f"is damaged: {error!r}") from None
+        if path.is_file():
+            return footage
+    return Footage(panels, last_panel=True) if panels.is_file() else None
 
 
 def _check_length(folder: Path, motion: Motion, other: Motion) -> None:
