@@ -61,6 +61,13 @@ def test_commands_in_the_docs_name_verbs_that_are_there(path: Path) -> None:
         ("egopose sync data.camera.field", {"data.camera.field_of_view="}),
         ("egopose train vision.camera.sh", {"vision.camera.shake=", "vision.camera.shake_time="}),
         ("egopose completion b", {"bash"}),
+        ("egopose view --of", {"--offset"}),
+        ("egopose view walk.b", set()),
+        ("egopose bench so", set()),
+        ("egopose bench st", {"stream"}),
+        ("egopose bench stream --js", {"--json"}),
+        ("egopose demo bu", {"budget="}),
+        ("egopose export t", {"to=", "take="}),
         ("egopose nothing x", set()),
     ],
 )

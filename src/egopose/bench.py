@@ -38,16 +38,21 @@ VERBS = {
 }
 
 
-def main(arguments: Sequence[str] | None = None) -> None:
-    """Command line."""
+def command_line() -> argparse.ArgumentParser:
+    """What may stand in the command."""
     parser = argparse.ArgumentParser(
-        prog="egopose.bench", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+        prog="egopose bench", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("verb", choices=list(VERBS))
     parser.add_argument("overrides", nargs="*", metavar="key=value", help="of the training configuration")
     parser.add_argument("--json", action="store_true", help="one JSON object on standard output")
     parser.add_argument("--rounds", type=int, help="how often: rounds, or kills (resume), or lengths (stream)")
-    options = parser.parse_intermixed_args(arguments)
+    return parser
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Command line."""
+    options = command_line().parse_intermixed_args(arguments)
     verb = import_module(f"egopose.benchmarks.{options.verb}")
     try:
         result = verb.run(options.overrides, VERBS[options.verb] if options.rounds is None else options.rounds)

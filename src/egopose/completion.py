@@ -6,6 +6,7 @@ nothing heavy.
 
 from __future__ import annotations
 
+import importlib
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -42,6 +43,10 @@ compdef _egopose egopose
 
 SCRIPTS = {"bash": _BASH, "zsh": _ZSH}
 
+_PARSED = ("bench", "view")  # verbs with options in the manner of --port
+_CONFIG = {"bench": "train", "demo": "train"}  # verbs whose settings stand in another's file
+_MORE = {"demo": ("budget=",), "export": ("to=",)}  # words that stand in no file
+
 
 def candidates(line: str, verbs: list[str]) -> list[str]:
     """What may stand in place of the last word of a command line; empty where a file name is to be completed.
@@ -56,7 +61,15 @@ def candidates(line: str, verbs: list[str]) -> list[str]:
         return [v for v in verbs if v.startswith(verb)]
     if verb == "completion":
         return [shell for shell in SCRIPTS if shell.startswith(word)]
-    folder = config_dir()
+    if verb in _PARSED and word.startswith("-"):
+        return [option for option in _options(verb) if option.startswith(word)]
+    if verb == "bench":
+        from egopose.bench import VERBS
+
+        if not set(words[2:-1]) & set(VERBS):
+            return [name for name in VERBS if name.startswith(word)]
+    more = [key for key in _MORE.get(verb, ()) if key.startswith(word)]
+    folder, verb = config_dir(), _CONFIG.get(verb, verb)
     if not (folder / f"{verb}.yaml").is_file():
         return []
     groups = _groups(folder, verb)
@@ -65,9 +78,15 @@ def candidates(line: str, verbs: list[str]) -> list[str]:
         choices = [path.stem for path in sorted((folder / key).glob("*.yaml"))] if key in groups else []
         return [f"{key}={choice}" for choice in choices if choice.startswith(value)]
     every = {f"{key}=" for key in groups} | set(_settings(folder, verb, groups))
-    matching = sorted(setting for setting in every if setting.startswith(word))
+    matching = [*more, *sorted(setting for setting in every if setting.startswith(word))]
     # As far as the next dot: the settings of a group are shown when it is named.
     return sorted({m[: m.find(".", len(word)) + 1] or m for m in matching})
+
+
+def _options(verb: str) -> list[str]:
+    """Of a verb that reads its command with argparse."""
+    parser = importlib.import_module(f"egopose.{verb}").command_line()
+    return [option for action in parser._actions for option in action.option_strings if option.startswith("--")]
 
 
 def _load(path: Path) -> dict[str, Any]:

@@ -39,8 +39,8 @@ def _is_source(word: str) -> bool:
     return word.startswith(_LIVE) or Path(word).exists()
 
 
-def main(arguments: Sequence[str] | None = None) -> None:
-    """Command line; serves until it is interrupted."""
+def command_line() -> argparse.ArgumentParser:
+    """What may stand in the command."""
     parser = argparse.ArgumentParser(
         prog="egopose view", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -52,7 +52,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--address", default="127.0.0.1", help="to listen at; any but this machine's own needs a token")
     parser.add_argument("--port", type=int, default=8080, help="0 for a free one")
     parser.add_argument("--token", help="16 letters and digits at least; `new` makes one and prints it")
-    options = parser.parse_args(arguments)
+    return parser
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Command line; serves until it is interrupted."""
+    options = command_line().parse_args(arguments)
     try:
         if find_spec("viser") is None:
             raise InputError("view", "viser", "is not installed; pip install 'egopose[view]'")
