@@ -25,8 +25,7 @@ from egopose.training.checkpoint import compare_states
 from egopose.training.loop import train
 
 
-@pytest.fixture(scope="module")
-def material() -> Material:
+def estimation_material() -> Material:
     humanoid: Any = stand_in()
     reference, takes = reference_motion(humanoid)
     generator = torch.Generator().manual_seed(0)
@@ -42,6 +41,11 @@ def material() -> Material:
         joint_targets=reference["qpos"][:, 7:].float(),
         states=humanoid_state(reference).float(),
     )
+
+
+@pytest.fixture(scope="module")
+def material() -> Material:
+    return estimation_material()
 
 
 #: The stand-in's hinges turn about z, y, x.

@@ -8,6 +8,8 @@ prepare_runtime()
 
 import logging  # noqa: E402
 import sys  # noqa: E402
+from collections.abc import Iterator  # noqa: E402
+from contextlib import contextmanager  # noqa: E402
 from pathlib import Path  # noqa: E402
 from typing import TYPE_CHECKING, Any  # noqa: E402
 
@@ -21,6 +23,7 @@ from egopose.errors import InputError  # noqa: E402
 
 if TYPE_CHECKING:
     from egopose.material import Material
+    from egopose.training.loop import BackgroundEvaluation, Evaluation, Run
 
 register_resolvers()
 
@@ -64,7 +67,8 @@ def run_training(
                 run.restore(checkpoint)
                 print(f"resuming {folder} after iteration {run.counters.iteration}", flush=True)
             loggers = build_loggers(config["logger"], folder, config, run.counters.iteration, run.counters.frames)
-            outcome = train(run, loggers, pipeline.build_evaluation(run, material))
+            with _evaluation(run, material) as evaluation:
+                outcome = train(run, loggers, evaluation)
         finally:
             run.collector.shutdown()
     except KeyboardInterrupt:
@@ -77,6 +81,22 @@ def run_training(
     figures = {"reason": outcome.reason, "iteration": outcome.iteration, "score": run.counters.score}
     mark_finished(folder, config, figures)
     return run.counters.score
+
+
+@contextmanager
+def _evaluation(run: Run, material: Material) -> Iterator[Evaluation | BackgroundEvaluation]:
+    """As ``training.evaluate_async`` says: between iterations, or beside them."""
+    from egopose.evaluators import BackgroundSurvival
+    from egopose.pipeline import build_evaluation
+
+    if not run.config["training"].get("evaluate_async") or not run.settings.evaluate_every:
+        yield build_evaluation(run, material)
+        return
+    background = BackgroundSurvival(run, material)
+    try:
+        yield background
+    finally:
+        background.close()
 
 
 def run_job(config: dict[str, Any], folder: Path, material: Material | None = None) -> float:

@@ -1,0 +1,126 @@
+"""TorchRL's evaluator on checkpoints and beside a training: the same survival figures, whoever runs the episodes."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+from typing import Any
+
+import pytest
+from test_forecasting_training import configuration as forecasting_configuration
+from test_forecasting_training import forecasting_material
+from test_training_pipeline import assert_equal, configuration, estimation_material
+
+from egopose import pipeline
+from egopose.errors import InputError
+from egopose.evaluation.survival import frames_survived
+from egopose.evaluators import BackgroundSurvival, checkpoint_evaluator
+from egopose.material import Material
+from egopose.training.logging import CsvCurves
+from egopose.training.loop import Run, train
+
+WORLDS, SEED = 5, 7
+
+
+def falling(config: dict[str, Any]) -> dict[str, Any]:
+    """The body counts as fallen soon, so that episodes end at different times."""
+    task = {**config["task"], "termination": {"enabled": True, "head_drop": 0.02}}
+    return {**config, "task": task, "training": {**config["training"], "evaluation_worlds": 12}}
+
+
+@pytest.fixture(scope="module")
+def estimating(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Material]:
+    folder, material = tmp_path_factory.mktemp("estimating"), estimation_material()
+    train(pipeline.build_run(falling(configuration()), folder, material), [])
+    return folder, material
+
+
+@pytest.fixture(scope="module")
+def forecasting(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Material]:
+    folder, material = tmp_path_factory.mktemp("forecasting"), forecasting_material()
+    train(pipeline.build_run(falling(forecasting_configuration()), folder, material), [])
+    return folder, material
+
+
+def survived(folder: Path, material: Material) -> tuple[float, float]:
+    agent = pipeline.load_agent(folder, material, which="latest")
+    found = frames_survived(agent.make_env("test", worlds=WORLDS), agent.actor, SEED)
+    return found.mean, float(found.fell.double().mean())
+
+
+def same_figures(folder: Path, material: Material, backend: str) -> None:
+    evaluator = checkpoint_evaluator(folder, backend, which="latest", worlds=WORLDS, seed=SEED, material=material)
+    try:
+        results = [evaluator.evaluate(), evaluator.evaluate()]
+        assert evaluator.trigger_eval(step=30)
+        results.append(evaluator.wait(60.0) or {})
+    finally:
+        evaluator.shutdown()
+    assert results[2]["eval/step"] == 30
+    for result in results:
+        assert (result["eval/frames"], result["eval/fell"]) == pytest.approx(survived(folder, material))
+
+
+def test_a_thread_finds_what_survival_is(estimating: tuple[Path, Material]) -> None:
+    frames, fell = survived(*estimating)
+    assert 0 < fell < 1
+    assert 0 < frames < 11
+    same_figures(*estimating, "thread")
+
+
+def test_a_forecasting_policy_keeps_its_memory(forecasting: tuple[Path, Material]) -> None:
+    same_figures(*forecasting, "thread")
+
+
+@pytest.mark.parametrize("task", ["estimating", pytest.param("forecasting", marks=pytest.mark.slow)])
+def test_a_process_of_its_own_finds_the_same(task: str, request: pytest.FixtureRequest) -> None:
+    same_figures(*request.getfixturevalue(task), "process")
+
+
+def test_other_backends_are_named(estimating: tuple[Path, Material]) -> None:
+    with pytest.raises(InputError, match="backend: must be one of thread, process"):
+        checkpoint_evaluator(estimating[0], "fork", material=estimating[1])
+
+
+def trained(folder: Path, material: Material, beside: bool) -> Run:
+    run = pipeline.build_run(falling(configuration(evaluate_every=1)), folder, material)
+    folder.mkdir(exist_ok=True)
+    curves = CsvCurves(folder / "curves.csv")
+    if not beside:
+        train(run, [curves], pipeline.build_evaluation(run, material))
+        return run
+    background = BackgroundSurvival(run, material)
+    try:
+        train(run, [curves], background)
+    finally:
+        background.close()
+    return run
+
+
+def looks(folder: Path) -> list[list[float]]:
+    keys = ("steps", "iteration", "evaluation/score", "evaluation/falls")
+    with (folder / "curves.csv").open() as stream:
+        return [[float(row[key]) for key in keys] for row in csv.DictReader(stream)]
+
+
+def test_beside_a_training_all_is_as_between_its_iterations(tmp_path: Path) -> None:
+    """Figures at the steps they belong to, and weights, statistics and worlds, to the bit."""
+    material = estimation_material()
+    between = trained(tmp_path / "between", material, beside=False)
+    beside = trained(tmp_path / "beside", material, beside=True)
+    assert len({row[2] for row in looks(tmp_path / "between")}) > 1
+    assert looks(tmp_path / "beside") == looks(tmp_path / "between")
+    assert beside.counters.score == between.counters.score
+    for name, part in between.checkpoint().components.items():
+        if name in ("policy", "critic", "transforms", "simulation"):
+            assert_equal(part.state_dict(), beside.checkpoint().components[name].state_dict(), name)
+
+
+def test_a_lost_process_is_told_and_training_goes_on(tmp_path: Path) -> None:
+    material = estimation_material()
+    run = pipeline.build_run(falling(configuration(evaluate_every=1, iterations=2)), tmp_path, material)
+    background = BackgroundSurvival(run, material)
+    background._process.kill()
+    with pytest.warns(UserWarning, match="lost its process"):
+        assert train(run, [], background).iteration == 2
+    background.close()
