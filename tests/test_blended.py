@@ -30,7 +30,7 @@ from egopose.vision.encoders import LightFlowEncoder
 
 KERNEL = {
     "cells": 2, "reach": 2, "step": 2, "width": 0.5, "axes": 6, "whitening": 0.5, "ridge": 0.03, "length": 1.0,
-    "centres": 1000, "share_step": 0.1,
+    "metric_rows": 50, "centres": 1000, "share_step": 0.1,
 }  # fmt: skip
 LOOKAHEAD = 3
 
@@ -63,6 +63,18 @@ def test_without_a_ridge_it_passes_through_what_it_learned_and_far_away_it_is_th
     torch.testing.assert_close(model(x), y, atol=1e-2, rtol=0)
     short = fit_kernel_regression(x, y, axes=4, whitening=0.5, ridge=1e-6, length=100.0)
     torch.testing.assert_close(short(torch.full((1, 4), 50.0))[0], y.mean(0), atol=1e-3, rtol=0)
+
+
+def test_the_metric_finds_the_direction_that_matters() -> None:
+    x = torch.randn(400, 12)
+    y = torch.sin(2 * x[:, :1])
+    fits = {"axes": 12, "whitening": 0.5, "ridge": 0.03, "length": 1.0}
+    plain = fit_kernel_regression(x[:300], y[:300], **fits)
+    fitted = fit_kernel_regression(x[:300], y[:300], **fits, importance=torch.ones(1))
+    errors = [float((model(x[300:]) - y[300:]).norm()) for model in (plain, fitted)]
+    assert errors[1] < 0.8 * errors[0]
+    reach = fitted.projection.norm(dim=1)
+    assert reach[0] > 1.5 * reach[1:].max()
 
 
 def test_inputs_that_never_change_do_no_harm() -> None:
@@ -210,7 +222,10 @@ def test_a_store_makes_keeps_and_reads_back_a_blended_regressor(folder: Path) ->
     table = window_table(store.flow(flow), whole, kernel_settings, 64)
     wanted = model.normalise(humanoid_state(store.reference))
     block = [Span(s.start, s.start + (s.stop - s.start) // 2) for s in half]
-    kernel = fit_kernel(table, wanted, without_block(half, block, 2, 2), kernel_settings)
+    importance = torch.zeros(115)
+    importance[[5 + dof for dof in range(52) if dof not in humanoid.hand_dofs]] = 1.0
+    importance *= model.state_std
+    kernel = fit_kernel(table, wanted, without_block(half, block, 2, 2), kernel_settings, importance)
     by_network = model.normalise(regressor_tables(network, store, humanoid, flow)[0]["humanoid_state"])
     for span in block:
         rows = slice(span.start, span.stop)

@@ -61,7 +61,15 @@ class KernelRegression(nn.Module):
 
 
 def fit_kernel_regression(
-    inputs: Tensor, outputs: Tensor, *, axes: int, whitening: float, ridge: float, length: float
+    inputs: Tensor,
+    outputs: Tensor,
+    *,
+    axes: int,
+    whitening: float,
+    ridge: float,
+    length: float,
+    importance: Tensor | None = None,
+    metric_rows: int = 600,
 ) -> KernelRegression:
     """The regression of ``outputs`` on ``inputs``, every row a centre.
 
@@ -72,6 +80,10 @@ def fit_kernel_regression(
         whitening: each axis is divided by its standard deviation to this power: 0 leaves them, 1 makes all count alike.
         ridge: added to the kernel's diagonal, which is 1.
         length: of the kernel, in medians of the distances between centres.
+        importance: ``[S]`` of the outputs for the metric, or None to leave all directions of the axes alike. With it a
+            first fit tells along which directions the outputs change, and a second one measures distances by that: one
+            step of a recursive feature machine (Radhakrishnan et al., Science 2024).
+        metric_rows: rows at which the first fit's slopes are taken, evenly chosen.
 
     Raises:
         ValueError: fewer than two rows.
@@ -87,6 +99,16 @@ def fit_kernel_regression(
     variances, directions = torch.linalg.eigh(standard.T @ standard / len(standard))
     variances, directions = variances[-kept:].clamp(min=1e-9), directions[:, -kept:]
     model.projection = (directions * variances ** (-whitening / 2)).float()
+    _solve(model, inputs, outputs, ridge, length)
+    if importance is not None:
+        rows = torch.linspace(0, len(inputs) - 1, min(metric_rows, len(inputs))).round().long()
+        model.projection = model.projection @ _slopes(model, rows, importance)
+        _solve(model, inputs, outputs, ridge, length)
+    return model.eval()
+
+
+def _solve(model: KernelRegression, inputs: Tensor, outputs: Tensor, ridge: float, length: float) -> None:
+    """Centres and coefficients of ``model`` for its projection."""
     model.centres = model.project(inputs)
     distances = torch.cdist(model.centres.double(), model.centres.double())
     model.length = (length / distances.median().clamp(min=1e-9)).float()
@@ -96,4 +118,18 @@ def fit_kernel_regression(
     kernel.diagonal().add_(ridge)
     factor = torch.linalg.cholesky(kernel)
     model.coefficients = torch.cholesky_solve(wanted - wanted.mean(0), factor).float()
-    return model.eval()
+
+
+def _slopes(model: KernelRegression, rows: Tensor, importance: Tensor) -> Tensor:
+    """``[axes, axes]`` square root of the square root of the mean outer product of the outputs' slopes at ``rows``."""
+    points, centres = model.centres[rows], model.centres
+    distance = torch.cdist(points, centres)
+    pull = model.length * (-model.length * distance).exp() / distance.clamp(min=1e-6)
+    pull[torch.arange(len(rows)), rows] = 0.0  # the kernel has a peak and no slope at its centre
+    total = torch.zeros(centres.shape[1], centres.shape[1], dtype=torch.float64)
+    for column in importance.nonzero()[:, 0].tolist():
+        weight = importance[column] * model.coefficients[:, column, None]
+        slope = pull @ (weight * centres) - points * (pull @ weight)
+        total += (slope.T @ slope).double()
+    variances, directions = torch.linalg.eigh(total * len(total) / total.trace().clamp(min=1e-12))
+    return ((directions * variances.clamp(min=0.0) ** 0.25) @ directions.T).float()

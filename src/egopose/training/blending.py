@@ -31,7 +31,7 @@ class KernelSettings:
     Args:
         cells: a side of the picture is divided into so many.
         reach, step, width: frames; see :class:`TimeWindows`.
-        axes, whitening, ridge, length: see :func:`fit_kernel_regression`.
+        axes, whitening, ridge, length, metric_rows: see :func:`fit_kernel_regression`.
         centres: moments of training remembered at most, evenly chosen.
         share_step: the shares are multiples of it.
     """
@@ -44,6 +44,7 @@ class KernelSettings:
     whitening: float
     ridge: float
     length: float
+    metric_rows: int
     centres: int
     share_step: float
 
@@ -52,7 +53,7 @@ class KernelSettings:
             if not ok:
                 raise InputError("regressor.kernel", name, cause)
 
-        check(min(self.cells, self.axes) > 0, "cells", "must be positive, as must axes")
+        check(min(self.cells, self.axes, self.metric_rows) > 0, "cells", "must be positive, as must axes, metric_rows")
         check(self.step > 0 and self.reach >= 0 and self.reach % self.step == 0, "step", "must divide reach")
         check(self.width > 0 and self.ridge > 0 and self.length > 0, "width", "must be positive, as must ridge, length")
         check(self.centres >= 2, "centres", "must be at least 2")
@@ -111,12 +112,13 @@ def blend(
         seen = window_table(flow, takes, kernel_settings, settings.encode_batch)
         wanted, by_network = network.normalise(states), network.normalise(crossed_states)
         by_kernel = torch.zeros_like(wanted)
+        importance = _importance(humanoid, network.state_std)
         for block in blocks:
             others = without_block(fragments, block, settings.margin, settings.margin)
-            left_out = fit_kernel(seen, wanted, others, kernel_settings)
+            left_out = fit_kernel(seen, wanted, others, kernel_settings, importance)
             for span in block:
                 by_kernel[span.start : span.stop] = left_out(seen[span.start : span.stop])
-        kernel = fit_kernel(seen, wanted, fragments, kernel_settings)
+        kernel = fit_kernel(seen, wanted, fragments, kernel_settings, importance)
     model = blended_regressor(network, kernel, kernel_settings.cells, kernel_settings.windows())
     frames = torch.cat([torch.arange(s.start, s.stop) for s in fragments])
     starts = torch.tensor([span.start for span in takes])
@@ -152,7 +154,9 @@ def window_table(flow: Flow, takes: Sequence[Span], settings: KernelSettings, ba
     return rows
 
 
-def fit_kernel(table: Tensor, wanted: Tensor, spans: Sequence[Span], settings: KernelSettings) -> KernelRegression:
+def fit_kernel(
+    table: Tensor, wanted: Tensor, spans: Sequence[Span], settings: KernelSettings, importance: Tensor
+) -> KernelRegression:
     """The kernel regression learned on ``spans``.
 
     Args:
@@ -160,6 +164,7 @@ def fit_kernel(table: Tensor, wanted: Tensor, spans: Sequence[Span], settings: K
         wanted: ``[F, S]`` states in normalised units.
         spans: training frames.
         settings: of the kernel.
+        importance: ``[S]`` of the state's numbers for what counts as alike.
     """
     frames = torch.cat([torch.arange(s.start, s.stop) for s in spans])
     if len(frames) > settings.centres:
@@ -171,7 +176,18 @@ def fit_kernel(table: Tensor, wanted: Tensor, spans: Sequence[Span], settings: K
         whitening=settings.whitening,
         ridge=settings.ridge,
         length=settings.length,
+        importance=importance,
+        metric_rows=settings.metric_rows,
     )
+
+
+def _importance(humanoid: HumanoidModel, state_std: Tensor) -> Tensor:
+    """``[S]``: the joint angles in rad without the hands, as E_pose has them; nothing else of the state."""
+    out = torch.zeros_like(state_std)
+    angles = slice(5, 5 + len(humanoid.joint_range))
+    out[angles] = state_std[angles]
+    out[5 + torch.as_tensor(humanoid.hand_dofs)] = 0.0
+    return out
 
 
 def share_groups(humanoid: HumanoidModel, state_std: Tensor) -> dict[str, tuple[Tensor, Tensor, Tensor]]:
