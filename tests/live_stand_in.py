@@ -27,7 +27,7 @@ def run_config(model: str, task: str, cross_fit: int = 1, smoothing: float = 0.0
         "vision": group("vision", "light"),
         "regressor": {**group("regressor", "fast"), "cross_fit": cross_fit},
         "model": group("model", model),
-        "algo": {},
+        "algo": {"gamma": 0.95},
     }
 
 

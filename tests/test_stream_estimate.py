@@ -206,9 +206,12 @@ def test_a_stop_from_outside_ends_it_at_once(walk: Path) -> None:
     json.dumps(told, allow_nan=False)
 
 
-def test_what_cannot_be_used_is_named(run: Path) -> None:  # noqa: F811
+def test_what_cannot_be_used_is_named(run: Path, tmp_path: Path) -> None:  # noqa: F811
     trained = untrained()
+    video = write_walk(tmp_path / "walk.mp4", 3)
     with pytest.raises(InputError, match="lookahead"):
-        build_loop(settings_of(lookahead=-1), trained, source_settings(settings_of(source="0")))
+        build_loop(settings_of(lookahead=-1), trained, source_settings(settings_of(source=str(video))))
     with pytest.raises(InputError, match="does not exist"):
-        stream(settings_of(source="0", checkpoint=str(run / "nothing")))
+        stream(settings_of(source=str(video), checkpoint=str(run / "nothing")))
+    with pytest.raises(InputError, match=r"out: is written as \.npz"):
+        stream(settings_of(source=str(video), checkpoint=str(run), out="motion.bvh"))

@@ -1,4 +1,4 @@
-"""``python -m egopose.stream source=0|VIDEO|ADDRESS|take:NAME checkpoint=RUN [out=MOTION.npz]``: motion, live."""
+"""``python -m egopose.stream source=0|VIDEO|ADDRESS|take:NAME checkpoint=RUN``: motion, live, and forecasts of it."""
 
 from __future__ import annotations
 
@@ -27,8 +27,10 @@ if TYPE_CHECKING:
 
     from egopose.humanoid.model import HumanoidModel
     from egopose.inference.causal import CausalRegression
-    from egopose.inference.stream.body import LiveBody, LivePose
-    from egopose.inference.stream.loop import LiveLoop, PoseSink, StatusSink
+    from egopose.inference.stream.body import LiveBody
+    from egopose.inference.stream.forecasting import ForecastThread
+    from egopose.inference.stream.futures import ForecastSettings
+    from egopose.inference.stream.loop import LiveLoop
     from egopose.inference.stream.sight import Sight
     from egopose.inference.stream.sources import SourceSettings
     from egopose.material import Material
@@ -75,24 +77,92 @@ def load_trained(checkpoint: str, which: str) -> Trained:
     config = read_json(folder, "config")
     humanoid = humanoid_of(config)
     regressor, made_with = load_regressor(run_folder(folder) / "regressor")
-    agent = load_agent(folder, two_frames(humanoid, regressor, made_with))
+    agent = load_agent(folder, still_frames(humanoid, regressor, made_with))
     env = agent.make_env("test", worlds=1, threads=1, whole_fragments=True, falls_end=False)
     return Trained(humanoid, regressor, made_with, env, agent.actor, agent.critic, config)
 
 
-def two_frames(humanoid: HumanoidModel, regressor: StateRegressor, made_with: Mapping[str, Any]) -> Material:
-    """The material of a take of two still frames: what an environment needs to be made before anything is seen."""
+@dataclass(frozen=True)
+class Forecaster:
+    """What a forecasting run brings to a stream.
+
+    Args:
+        env: ``1 + drawn futures`` worlds, on a take of still frames.
+        actor, regressor: in eval mode.
+        flow_size: S of the flow its encoder sees.
+        settings: of the stream's forecasts.
+    """
+
+    env: TransformedEnv
+    actor: TensorDictModuleBase
+    regressor: StateRegressor
+    flow_size: int
+    settings: ForecastSettings
+
+
+def forecast_settings(values: Mapping[str, Any]) -> ForecastSettings:
+    """The group ``forecast`` of ``conf/stream.yaml``, resolved.
+
+    Raises:
+        InputError: a value that cannot be.
+    """
+    from egopose.inference.stream.futures import ForecastSettings
+
+    beside = ("checkpoint", "which", "out")
+    chosen = {name: value for name, value in values["forecast"].items() if name not in beside}
+    return from_mapping(ForecastSettings, chosen, f"{_CONFIG}: forecast")
+
+
+def load_forecaster(values: Mapping[str, Any], trained: Trained) -> Forecaster | None:
+    """The forecasting policy ``forecast.checkpoint`` names, for the body of ``trained``; None where it names none.
+
+    Raises:
+        InputError: it cannot be used, or is of another body or another flow than the estimating run's.
+    """
+    from egopose.data.preparation import humanoid_of
+    from egopose.estimate import run_folder
+    from egopose.pipeline import load_agent
+    from egopose.regression import load_regressor
+    from egopose.training.checkpoint import find_checkpoint, read_json
+
+    settings, checkpoint = forecast_settings(values), values["forecast"]["checkpoint"]
+    if checkpoint is None:
+        return None
+    folder = find_checkpoint(str(checkpoint), str(values["forecast"]["which"]))
+    config = read_json(folder, "config")
+    task = config["task"]
+    if task.get("context") is None or config["model"]["context"]["source"] != "past":
+        cause = "a live forecast is one of `egopose train experiment=forecasting`; name such a run, or null for none"
+        raise InputError(folder, "task", f"this run's is {task['name']}: {cause}")
+    humanoid = humanoid_of(config)
+    if humanoid.skeleton != trained.humanoid.skeleton or humanoid.control_dt != trained.humanoid.control_dt:
+        raise InputError(folder, "humanoid", "another body than the estimating run's: train both with one humanoid")
+    regressor, made_with = load_regressor(run_folder(folder) / "regressor")
+    flows = ({**dict(made["vision"]["flow"]), "workers": 1} for made in (made_with, trained.made_with))
+    if len({tuple(sorted(flow.items())) for flow in flows}) > 1:
+        raise InputError(folder, "vision.flow", "another flow than the estimating run's: train both with one vision")
+    agent = load_agent(folder, still_frames(humanoid, regressor, made_with, task["context"] + task["minimum"]))
+    env = agent.make_env("test", worlds=1 + settings.drawn, threads=1, whole_fragments=True, falls_end=False)
+    return Forecaster(env, agent.actor, regressor, int(made_with["vision"]["flow"]["stored_size"]), settings)
+
+
+def still_frames(
+    humanoid: HumanoidModel, regressor: StateRegressor, made_with: Mapping[str, Any], frames: int = 2
+) -> Material:
+    """The material of a take of still frames: what an environment needs to be made before anything is seen."""
     import numpy as np
 
     from egopose.estimate import seen_in, video_material
 
     size = int(made_with["vision"]["flow"]["stored_size"])
-    still = np.zeros((2, 2, size, size), np.float16)
+    still = np.zeros((frames, 2, size, size), np.float16)
     return video_material(humanoid, seen_in(humanoid, regressor, still, made_with), "stream")[0]
 
 
-def build_loop(values: Mapping[str, Any], trained: Trained, source: SourceSettings) -> LiveLoop:
-    """The loop of ``conf/stream.yaml``, resolved, on a run's networks.
+def build_loop(
+    values: Mapping[str, Any], trained: Trained, source: SourceSettings, forecaster: Forecaster | None = None
+) -> LiveLoop:
+    """The loop of ``conf/stream.yaml``, resolved, on a run's networks, with forecasts beside it where there are any.
 
     Raises:
         InputError: a setting is wrong.
@@ -107,6 +177,7 @@ def build_loop(values: Mapping[str, Any], trained: Trained, source: SourceSettin
     from egopose.inference.stream.loop import STAGES, LiveLoop, LoopSettings
     from egopose.inference.stream.sight import Sight
     from egopose.vision.flow import FlowConfig
+    from egopose.vision.lens import Camera
 
     for name, least in (("threads", 1), ("opencv_threads", 1), ("lookahead", 0), ("bridge", 0), ("latency_frames", 1)):
         if not isinstance(values[name], int) or values[name] < least:
@@ -117,19 +188,46 @@ def build_loop(values: Mapping[str, Any], trained: Trained, source: SourceSettin
     limits = {name: values[name] for name in ("seconds", "bridge")}
     settings = from_mapping(LoopSettings, limits, _CONFIG)
     flow = FlowConfig(**dict(trained.made_with["vision"]["flow"]))
+    camera = Camera.from_mapping(values["camera"], "camera")
+    rate = 1.0 / trained.humanoid.control_dt
     latency = LatencyTable(STAGES, values["latency_frames"])
 
     def parts(lap: Callable[[str], None]) -> tuple[Sight, CausalRegression, LiveBody]:
         """As at the start: nothing seen yet."""
         task, lookahead = trained.config["task"], values["lookahead"]
         return (
-            Sight(trained.regressor, flow),
+            Sight(trained.regressor, flow, camera, rate),
             causal_regression(trained.humanoid, trained.regressor, trained.made_with, task, lookahead),
             LiveBody(trained.env, trained.actor, trained.critic, failsafe, lap),
         )
 
     warm_up(*parts(lambda stage: None))
-    return LiveLoop(source, *parts(latency.lap), latency, 1.0 / trained.humanoid.control_dt, settings)
+    beside = None if forecaster is None else _forecasts(values, forecaster, failsafe.fallen_height, rate)
+    return LiveLoop(source, *parts(latency.lap), latency, rate, settings, beside)
+
+
+def _forecasts(values: Mapping[str, Any], forecaster: Forecaster, fallen_height: float, rate: float) -> ForecastThread:
+    """The thread, not yet begun, whose parts have done their work once."""
+    import time
+
+    import numpy as np
+
+    from egopose.inference.stream.forecasting import ForecastThread
+    from egopose.inference.stream.futures import STAGES, LiveFutures, Moment
+    from egopose.inference.stream.latency import LatencyTable
+
+    settings = forecaster.settings
+    every = max(round(settings.every * rate), 1)
+    capacity = max(values["latency_frames"] // every, 1)
+    latency = LatencyTable(STAGES, capacity, ("forecast", "forecast_delay"))
+
+    futures = LiveFutures(forecaster.env, forecaster.actor, forecaster.regressor, settings, fallen_height)
+    size, humanoid = forecaster.flow_size, forecaster.env.base_env.problem.humanoid
+    still = np.zeros((futures.context, 2, size, size), np.float32)
+    standing = humanoid.skeleton.rest_qpos()
+    standing[2] = 1.0
+    futures.roll(Moment(0, standing, np.zeros(humanoid.mj_model.nv), still, time.perf_counter()))
+    return ForecastThread(futures, every, values["lookahead"], latency, values["pace"] == "every")
 
 
 def warm_up(sight: Sight, regression: CausalRegression, body: LiveBody) -> None:
@@ -139,7 +237,7 @@ def warm_up(sight: Sight, regression: CausalRegression, body: LiveBody) -> None:
     still = np.zeros((64, 64, 3), np.uint8)
     poses = frame = 0
     while poses < 3:
-        seen = regression.push(frame, sight.features(sight.flow(still)))
+        seen = regression.push(frame, sight.features(sight.flow(still, frame / 30)))
         frame += 1
         if seen is not None:
             body.advance(seen)
@@ -152,9 +250,12 @@ def source_settings(values: Mapping[str, Any], config: Mapping[str, Any] | None 
     Raises:
         InputError: no such take or file, a file that is no video, an address of an unknown kind.
     """
-    from egopose.inference.stream.sources import SourceSettings, check_source
+    from egopose.inference.stream.sources import ReconnectSettings, SourceSettings, check_source
+    from egopose.vision.lens import Camera
 
     given = {name: values[name] for name in ("pace", "repeat", "offset")}
+    given["reconnect"] = from_mapping(ReconnectSettings, values["reconnect"], f"{_CONFIG}: reconnect")
+    given["fps"] = Camera.from_mapping(values["camera"], "camera").fps
     settings = from_mapping(SourceSettings, {**given, "source": str(values["source"])}, _CONFIG)
     if settings.source.startswith("take:"):
         if config is None:
@@ -191,19 +292,20 @@ def stream(values: Mapping[str, Any], stop: threading.Event | None = None) -> di
     Raises:
         InputError: source, run or setting cannot be used; names it.
     """
-    from egopose.inference.stream.broadcast import ServerSettings
+    from egopose.inference.stream.outputs import check_outputs, open_outputs
 
-    server = from_mapping(ServerSettings, values["server"], f"{_CONFIG}: server")
+    check_outputs(values)
     source_settings(values)
     trained = load_trained(str(values["checkpoint"]), str(values["which"]))
+    forecaster = load_forecaster(values, trained)
     source = source_settings(values, trained.config)
-    loop = build_loop(values, trained, source)
-    fps = 1.0 / trained.humanoid.control_dt
+    loop = build_loop(values, trained, source, forecaster)
     with contextlib.ExitStack() as stack:
-        on_pose, on_status = _outputs(values, server, trained, source, fps, stack)
+        forecast = None if forecaster is None else forecaster.settings
+        sinks = open_outputs(values, trained.humanoid, source, forecast, stack)
         settle_memory()
-        last = loop.run(on_pose, on_status, stop)
-        on_status({**last, "end": True})
+        last = loop.run(sinks.on_pose, sinks.on_status, stop, sinks.on_forecast)
+        sinks.on_status({**last, "end": True})
     return last
 
 
@@ -213,50 +315,15 @@ def settle_memory() -> None:
     gc.freeze()
 
 
-def _outputs(
-    values: Mapping[str, Any],
-    server: Any,
-    trained: Trained,
-    source: SourceSettings,
-    fps: float,
-    stack: contextlib.ExitStack,
-) -> tuple[PoseSink, StatusSink]:
-    """What the loop tells its poses and status; closed by ``stack``."""
-    from egopose.inference.stream import messages
-    from egopose.inference.stream.broadcast import Broadcast
-    from egopose.inference.stream.recording import Recording
-
-    skeleton, recording, broadcast = trained.humanoid.skeleton, None, None
-    if values["out"] is not None:
-        recording = Recording(Path(str(values["out"])), skeleton, fps)
-        stack.callback(recording.close)
-    if server.port is not None:
-        broadcast = Broadcast(server, messages.hello(skeleton, fps, int(values["lookahead"]), source.source))
-        stack.callback(broadcast.close)
-        print(f"ws://{server.host}:{broadcast.port}/json and /binary", flush=True)
-
-    def on_pose(pose: LivePose, delay_ms: float) -> None:
-        if recording is not None:
-            recording.pose(pose)
-        if broadcast is not None and (kinds := broadcast.kinds):
-            text = messages.frame_json(pose, fps, delay_ms) if False in kinds else None
-            binary = messages.frame_binary(pose, fps, delay_ms) if True in kinds else None
-            broadcast.send(text, binary)
-
-    def on_status(status: dict[str, Any]) -> None:
-        if broadcast is not None:
-            broadcast.send(messages.status({**status, "clients_dropped": broadcast.dropped}))
-
-    return on_pose, on_status
-
-
 def print_report(status: Mapping[str, Any]) -> None:
     """Counts and the latency table, to standard output."""
-    counts = ("poses", "used", "dropped", "surplus", "bridged", "lost", "resets")
-    print(f"{status['seconds']:.1f} s, " + ", ".join(f"{status[name]} {name}" for name in counts))
-    print(f"{'stage':10s} {'p50 ms':>8s} {'p95 ms':>8s} {'p99 ms':>8s}")
+    counts = ["poses", "used", "dropped", "surplus", "bridged", "lost", "resets", "reconnects"]
+    counts += ["forecasts", "forecasts_skipped"]
+    words = (f"{status[name]} {name.replace('_', ' ')}" for name in counts)
+    print(f"{status['seconds']:.1f} s, " + ", ".join(words))
+    print(f"{'stage':16s} {'p50 ms':>8s} {'p95 ms':>8s} {'p99 ms':>8s}")
     for stage, row in status["stages"].items():
-        print(f"{stage:10s} " + " ".join(f"{row[key]:8.2f}" for key in ("p50_ms", "p95_ms", "p99_ms")))
+        print(f"{stage:16s} " + " ".join(f"{row[key]:8.2f}" for key in ("p50_ms", "p95_ms", "p99_ms")))
 
 
 @command("stream")

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
+import sys
+import threading
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -14,10 +17,11 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from egopose.humanoid.model import HumanoidModel
-    from egopose.stream import Trained
+    from egopose.stream import Forecaster, Trained
 
 _PREFIX = "stream."
 _SECONDS = 20.0  # of a round, unless told: 600 frames, of which six are beyond the 99th percentile
+_TELL_EVERY = 60.0  # s
 
 
 def run(overrides: Sequence[str], rounds: int) -> dict[str, Any]:
@@ -25,28 +29,36 @@ def run(overrides: Sequence[str], rounds: int) -> dict[str, Any]:
 
     Without ``stream.checkpoint`` the networks are untrained (their weights' values cost nothing) and of the training
     configuration; without ``stream.source`` the video is the longest rendered take of its data, or of the run's.
+    ``stream.forecast.checkpoint=untrained`` puts forecasts beside it, by untrained networks of ``task=forecasting``.
+    A soak, ``stream.pace=real_time``, leaves the first part out: it costs what a live camera costs. Each minute's
+    memory is then told on standard error.
+
+    Results go nowhere, but for what is named: ``stream.out``, ``stream.forecast.out``, and ``stream.server.port``,
+    which is read along by a client of each kind.
 
     Args:
         overrides: ``stream.KEY=VALUE`` of ``conf/stream.yaml``, all others of the training configuration.
         rounds: see above.
 
     Returns:
-        At full speed: ``fps``. At a camera's pace: ``p50_ms``, ``p95_ms``, ``p99_ms`` of a frame's computing,
-        ``dropped`` (late frames), ``stages`` (percentiles of each stage; ``delay``: from a frame's arrival to the
-        estimate it completes), ``paced_fps``, ``cores`` (processor time over time), the counts and memory of
-        :meth:`egopose.inference.stream.loop.LiveLoop.status`. Beside them ``source``, ``policy``, ``vision``,
-        ``substeps``.
+        At full speed: ``fps``, and of a soak as ``paced_fps``. At a camera's pace: ``p50_ms``, ``p95_ms``, ``p99_ms``
+        of a frame's computing, ``dropped`` (late frames), ``stages`` (percentiles of each stage; ``delay``: from a
+        frame's arrival to the estimate it completes), ``paced_fps``, ``cores`` (processor time over time), the counts
+        and memory of :meth:`egopose.inference.stream.loop.LiveLoop.status`. Beside them ``source``, ``policy``,
+        ``vision``, ``substeps``.
 
     Raises:
         InputError: a setting is unknown or out of range, the source cannot be read.
     """
     from egopose.config import compose_config
-    from egopose.stream import build_loop, load_trained, settle_memory, source_settings
+    from egopose.stream import load_forecaster, load_trained
 
     ours = [word.removeprefix(_PREFIX) for word in overrides if word.startswith(_PREFIX)]
     named = {word.split("=")[0] for word in ours}
     # What a command line has to say, a benchmark may leave open.
-    values = compose_config("stream", [*(f"{key}=null" for key in {"source", "checkpoint"} - named), *ours])
+    values = compose_config(
+        "stream", [*(f"{key}=null" for key in {"source", "checkpoint", "server.port"} - named), *ours]
+    )
     seconds = _SECONDS if values["seconds"] is None else values["seconds"]
     training = [word for word in overrides if not word.startswith(_PREFIX)]
     if values["checkpoint"] is None:
@@ -55,23 +67,22 @@ def run(overrides: Sequence[str], rounds: int) -> dict[str, Any]:
         raise InputError("bench stream", training[0], "a checkpoint brings its own configuration")
     else:
         trained = load_trained(str(values["checkpoint"]), str(values["which"]))
+    if values["forecast"]["checkpoint"] == "untrained":
+        forecaster: Forecaster | None = untrained_forecaster(values, trained)
+    else:
+        forecaster = load_forecaster(values, trained)
     source = longest_take(trained.config) if values["source"] is None else str(values["source"])
+    soak = "pace" in named and values["pace"] == "real_time"
     values = {**values, "source": source, "repeat": True}
 
-    def measured(pace: str, length: float) -> dict[str, Any]:
-        chosen = {**values, "pace": pace, "seconds": length}
-        loop = build_loop(chosen, trained, source_settings(chosen, trained.config))
-        settle_memory()
-        return loop.run(lambda pose, delay: None, lambda status: None)
-
-    quick = measured("every", seconds)
+    quick = None if soak else _measured({**values, "pace": "every", "seconds": seconds}, trained, forecaster, False)
     busy = time.process_time()
-    paced = measured("real_time", seconds * rounds)
+    paced = _measured({**values, "pace": "real_time", "seconds": seconds * rounds}, trained, forecaster, soak)
     compute = paced["stages"].get("compute")
     if compute is None:
         raise InputError("bench stream", "stream.seconds", f"{seconds}: too short for a single frame")
     return {
-        "fps": quick["fps"],
+        "fps": (quick or paced)["fps"],
         **compute,
         "dropped": paced["dropped"],
         "stages": paced["stages"],
@@ -80,10 +91,55 @@ def run(overrides: Sequence[str], rounds: int) -> dict[str, Any]:
         **{key: value for key, value in paced.items() if key not in ("dropped", "stages", "fps")},
         "source": Path(source).name,
         "policy": "untrained" if values["checkpoint"] is None else str(values["checkpoint"]),
+        "forecasts_by": str(values["forecast"]["checkpoint"]),
         "vision": str(trained.made_with["vision"]["encoder"]["kind"]),
         "substeps": trained.humanoid.substeps,
         "processors": len(os.sched_getaffinity(0)),
     }
+
+
+def _measured(
+    values: Mapping[str, Any], trained: Trained, forecaster: Forecaster | None, progress: bool
+) -> dict[str, Any]:
+    """The last status of one stream."""
+    from egopose.inference.stream.outputs import open_outputs
+    from egopose.stream import build_loop, settle_memory, source_settings
+
+    source = source_settings(values, trained.config)
+    loop = build_loop(values, trained, source, forecaster)
+    told = 0.0
+    with contextlib.ExitStack() as stack:
+        forecast = None if forecaster is None else forecaster.settings
+        sinks = open_outputs(values, trained.humanoid, source, forecast, stack)
+        if sinks.port is not None:
+            _listen(f"ws://{values['server']['host']}:{sinks.port}", values["server"]["token"])
+
+        def on_status(status: dict[str, Any]) -> None:
+            nonlocal told
+            sinks.on_status(status)
+            if progress and status["seconds"] - told >= _TELL_EVERY:
+                told = status["seconds"]
+                counts = f"{status['used']} frames, {status['dropped']} dropped, {status['forecasts']} forecasts"
+                memory = float("nan") if status["rss_mb"] is None else status["rss_mb"]
+                print(f"{told:.0f} s, {counts}, {memory:.1f} MB", file=sys.stderr, flush=True)
+
+        settle_memory()
+        return loop.run(sinks.on_pose, on_status, None, sinks.on_forecast)
+
+
+def _listen(server: str, token: str | None) -> None:
+    """A client of each kind that reads along until the server closes."""
+    from websockets.exceptions import WebSocketException
+    from websockets.sync.client import connect
+
+    def read(kind: str) -> None:
+        address = f"{server}/{kind}" + (f"?token={token}" if token else "")
+        with contextlib.suppress(OSError, WebSocketException), connect(address, proxy=None, max_size=None) as client:
+            for _ in client:
+                pass
+
+    for kind in ("json", "binary"):
+        threading.Thread(target=read, args=(kind,), daemon=True).start()
 
 
 def longest_take(config: Mapping[str, Any]) -> str:
@@ -121,7 +177,7 @@ def untrained_on(config: Mapping[str, Any], humanoid: HumanoidModel, states: Ten
     """
     from egopose.config import from_mapping
     from egopose.pipeline import build_env, build_networks
-    from egopose.stream import Trained, two_frames
+    from egopose.stream import Trained, still_frames
     from egopose.training.fragments import Span
     from egopose.training.regressor_settings import RegressorSettings
     from egopose.training.supervised import build_regressor
@@ -131,7 +187,33 @@ def untrained_on(config: Mapping[str, Any], humanoid: HumanoidModel, states: Ten
     settings = from_mapping(RegressorSettings, config["regressor"], "conf/regressor")
     regressor = build_regressor(encoder, states, [Span(0, len(states))], settings, encoder.features).eval()
     made_with = {"vision": config["vision"], "regressor": config["regressor"]}
-    material = two_frames(humanoid, regressor, made_with)
+    material = still_frames(humanoid, regressor, made_with)
     env = build_env(config, material, "test", worlds=1, whole_fragments=True, falls_end=False)
     actor, critic = build_networks(config, material, env)
     return Trained(humanoid, regressor, made_with, env, actor.eval(), critic.eval(), config)
+
+
+def untrained_forecaster(values: Mapping[str, Any], trained: Trained) -> Forecaster:
+    """A forecasting policy before training that sees through ``trained``'s own encoder, on its kind of physics.
+
+    Args:
+        values: ``conf/stream.yaml``, resolved.
+        trained: whose body is forecast.
+
+    Raises:
+        InputError: a setting is wrong.
+    """
+    from egopose.config import compose_config
+    from egopose.pipeline import build_env, build_networks
+    from egopose.stream import Forecaster, forecast_settings, still_frames
+
+    settings = forecast_settings(values)
+    config = compose_config("train", ["experiment=forecasting"])
+    config = {**config, **{group: trained.config[group] for group in ("sim", "humanoid")}}
+    frames = config["task"]["context"] + config["task"]["minimum"]
+    material = still_frames(trained.humanoid, trained.regressor, trained.made_with, frames)
+    worlds = 1 + settings.drawn
+    env = build_env(config, material, "test", worlds=worlds, whole_fragments=True, falls_end=False)
+    actor, _ = build_networks(config, material, env)
+    size = int(trained.made_with["vision"]["flow"]["stored_size"])
+    return Forecaster(env, actor.eval(), trained.regressor, size, settings)

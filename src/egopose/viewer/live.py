@@ -1,10 +1,11 @@
-"""What `egopose stream` sends, as it comes: the body, its value and the fail-safe's confidence."""
+"""What `egopose stream` sends, as it comes: the body, its forecast, its value and the fail-safe's confidence."""
 
 from __future__ import annotations
 
 import json
 import threading
 from collections import deque
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -14,13 +15,33 @@ from websockets.sync.client import connect
 from egopose.errors import InputError
 from egopose.motion.io.native import skeleton_from_json
 from egopose.motion.kinematics import forward_kinematics
+from egopose.motion.rotations import Array
 from egopose.viewer.curves import Chart
 from egopose.viewer.door import Address
+from egopose.viewer.figure import Color
 from egopose.viewer.serving import furnish, open_server
 from egopose.viewer.shapes import surface_of
 
+#: Frames ahead and opacity: the poses of a forecast that are shown, fading.
+AHEAD = ((12, 0.4), (24, 0.26), (45, 0.15), (75, 0.09))
+
 _KEPT = 300  # frames in the charts: 10 s
 _TICK = 1 / 30
+_CHARTS_EVERY = 30  # pictures between charts: 1 s
+_BODY: Color = (70, 110, 220)
+_NONE = "none"
+_LARGEST = 2**24  # bytes of a message: a forecast of 30 s with bands is one million
+
+
+@dataclass(frozen=True, eq=False)
+class _Coming:
+    """A forecast: row 0 is the frame after ``frame``; ``bands`` are low and high ``[H, nu]`` rad, or None."""
+
+    frame: int
+    qpos: Array
+    positions: Array
+    quats: Array
+    bands: tuple[Array, ...] | None
 
 
 class LiveViewer:
@@ -32,6 +53,7 @@ class LiveViewer:
 
     Attributes:
         frame: the newest shown, -1 before the first.
+        forecast: the frame that the forecast shown begins after, -1 before the first.
 
     Raises:
         InputError: no stream there, or it does not speak as ours; the address cannot be listened at.
@@ -39,7 +61,7 @@ class LiveViewer:
 
     def __init__(self, source: str, address: Address) -> None:
         try:
-            self._stream = connect(source, proxy=None)
+            self._stream = connect(source, proxy=None, max_size=_LARGEST)
             hello = json.loads(self._stream.recv(timeout=10))
             self._skeleton, self._fps = skeleton_from_json(hello["skeleton"]), float(hello["fps"])
         except (OSError, WebSocketException, ValueError, KeyError, TypeError) as error:
@@ -50,13 +72,26 @@ class LiveViewer:
         rest = self._surface.posed(
             *(x[0] for x in forward_kinematics(self._skeleton, self._skeleton.rest_qpos()[None]))
         )
-        self._mesh = self._server.scene.add_mesh_simple("/world/live", rest, self._surface.faces, color=(70, 110, 220))
-        self._status = self._server.gui.add_markdown("waiting")
-        self._charts = {n: Chart(self._server.gui, n) for n in ("value", "confidence")}
+        scene, gui = self._server.scene, self._server.gui
+        self._mesh = scene.add_mesh_simple("/world/live", rest, self._surface.faces, color=_BODY)
+        self._ghosts = [
+            scene.add_mesh_simple(
+                f"/world/ahead{ahead}", rest, self._surface.faces, color=_BODY, opacity=opacity, cast_shadow=False,
+                visible=False,
+            )
+            for ahead, opacity in AHEAD
+        ]  # fmt: skip
+        self._status = gui.add_markdown("waiting")
+        self._charts = {n: Chart(gui, n) for n in ("value", "confidence")}
+        joints = self._skeleton.joints
+        self._degrees = [f"{joint.name}_{k}" for joint in joints[1:] for k in range(len(joint.dofs))]
+        self._joint: Any = gui.add_dropdown("Joint", [_NONE, *self._degrees], initial_value=_NONE, visible=False)
+        self._angle = Chart(gui, "Forecast of a joint angle and its band, rad")
         self._past: dict[str, deque[float]] = {n: deque(maxlen=_KEPT) for n in self._charts}
         self._newest: dict[str, Any] | None = None
+        self._coming: _Coming | None = None
         self._stop = threading.Event()
-        self.frame = -1
+        self.frame = self.forecast = -1
         self._threads = [threading.Thread(target=work, daemon=True) for work in (self._listen, self._show)]
         for thread in self._threads:
             thread.start()
@@ -69,24 +104,62 @@ class LiveViewer:
                     for name, past in self._past.items():
                         past.append(np.nan if message[name] is None else float(message[name]))
                     self._newest = message
+                elif message.get("type") == "forecast":
+                    self._coming = self._read_forecast(message)
         except (OSError, WebSocketException, ValueError, KeyError, TypeError):
             pass  # told below: nothing comes any more
         self._stop.set()
 
+    def _read_forecast(self, message: dict[str, Any]) -> _Coming:
+        qpos = np.array(message["qpos"], dtype=np.float64).reshape(-1, self._skeleton.nq)
+        bands = None
+        if message["low"] is not None:
+            shape = len(qpos), self._skeleton.nq - 7
+            bands = tuple(np.array(message[edge], dtype=np.float64).reshape(shape) for edge in ("low", "high"))
+        return _Coming(int(message["frame"]), qpos, *forward_kinematics(self._skeleton, qpos), bands)
+
     def _show(self) -> None:
+        shown = 0
         while not self._stop.wait(_TICK):
             newest = self._newest
             if newest is None or newest["frame"] == self.frame:
                 continue
             self.frame = int(newest["frame"])
             qpos = np.array(newest["qpos"], dtype=np.float64)[None]
-            self._mesh.vertices = self._surface.posed(*(x[0] for x in forward_kinematics(self._skeleton, qpos)))
-            self._world.position = (-qpos[0, 0], -qpos[0, 1], 0.0)
+            coming = self._coming
+            with self._server.atomic():
+                self._mesh.vertices = self._surface.posed(*(x[0] for x in forward_kinematics(self._skeleton, qpos)))
+                self._world.position = (-qpos[0, 0], -qpos[0, 1], 0.0)
+                if coming is not None:
+                    self._show_ahead(coming)
             self._status.content = f"live, frame {self.frame}, {newest['delay_ms']:.0f} ms behind"
-            if self.frame % 60 == 0:
+            shown += 1
+            if shown % _CHARTS_EVERY == 0:
                 for name, chart in self._charts.items():
-                    chart.set({name: (np.array(self._past[name]), "rgb(70,110,220)")}, self._fps)
+                    chart.set({name: (np.array(self._past[name]), f"rgb{_BODY}")}, self._fps)
+                if coming is not None:
+                    self._chart_ahead(coming)
         self._status.content = f"ended after frame {self.frame}"
+
+    def _show_ahead(self, coming: _Coming) -> None:
+        """The poses some frames after the one shown, as far as the newest forecast reaches."""
+        for ghost, (ahead, _) in zip(self._ghosts, AHEAD, strict=True):
+            row = self.frame + ahead - coming.frame - 1
+            ghost.visible = 0 <= row < len(coming.qpos)
+            if ghost.visible:
+                ghost.vertices = self._surface.posed(coming.positions[row], coming.quats[row])
+        self._joint.visible = True
+        self.forecast = coming.frame
+
+    def _chart_ahead(self, coming: _Coming) -> None:
+        name, lines = self._joint.value, {}
+        if name != _NONE:
+            column = self._degrees.index(name)
+            if coming.bands is not None:
+                low, high = (edge[:, column] for edge in coming.bands)
+                lines = {"high": (high, "#9ab"), "low": (low, "#9ab")}
+            lines["forecast"] = (coming.qpos[:, 7 + column], f"rgb{_BODY}")
+        self._angle.set(lines, self._fps, ("high", "low"))
 
     def close(self) -> None:
         """Leave the stream and serve no more."""

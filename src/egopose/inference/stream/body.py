@@ -139,6 +139,10 @@ class LiveBody:
         self._lap("physics")
         return pose
 
+    def state(self) -> tuple[Array, Array]:
+        """``qpos [nq]`` and ``qvel [nv]`` at the frame :meth:`advance` reached; views, which its next call changes."""
+        return self._physics.qpos[0], self._physics.qvel[0]
+
     def _observe(self, now: Seen, ahead: Seen) -> TensorDictBase:
         """The observation ``[1]`` at ``now``, as the environment makes it from its tables."""
         for live in self._contexts:

@@ -1,4 +1,9 @@
-"""Which control frame a camera's frame belongs to, whatever the camera's rate."""
+"""Which control frames a camera's frame stands for, whatever the camera's rate.
+
+A frame at the control rate (or a whole multiple of it) stands for one control frame; one of a slower camera, or after
+late ones were dropped, for all the control frames that passed since the last one used; one of a quicker camera for
+none where less than a quarter of a control frame has passed.
+"""
 
 from __future__ import annotations
 

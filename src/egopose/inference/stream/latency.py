@@ -13,16 +13,16 @@ PERCENTILES = (50, 95, 99)
 class LatencyTable:
     """Seconds a stage and frame, of the last ``capacity`` frames.
 
-    Between :meth:`begin` and :meth:`end` each :meth:`lap` adds the time since the lap before to its stage; ``compute``
-    is their sum.
+    Between :meth:`begin` and :meth:`end` each :meth:`lap` adds the time since the lap before to its stage.
 
     Args:
         stages: names.
         capacity: frames remembered; all of the memory is taken at once.
+        totals: names of the sum of the stages, and of the time from a frame's arrival to its end.
     """
 
-    def __init__(self, stages: Sequence[str], capacity: int) -> None:
-        self.stages = (*stages, "compute", "delay")
+    def __init__(self, stages: Sequence[str], capacity: int, totals: tuple[str, str] = ("compute", "delay")) -> None:
+        self.stages = (*stages, *totals)
         self._column = {name: i for i, name in enumerate(self.stages)}
         self._rows = np.full((capacity, len(self.stages)), np.nan, dtype=np.float32)
         self._row = np.zeros(len(self.stages))
@@ -42,7 +42,7 @@ class LatencyTable:
         self._last = now
 
     def end(self, arrived: float) -> None:
-        """The frame is done; ``delay`` is counted from ``arrived`` (s, ``time.perf_counter``)."""
+        """The frame is done; its delay is counted from ``arrived`` (s, ``time.perf_counter``)."""
         self._row[-2] = self._row[:-2].sum()
         self._row[-1] = self._last - arrived
         self._rows[self.frames % len(self._rows)] = self._row

@@ -3,6 +3,8 @@
 The rule for late frames: only the newest frame waits (:class:`NewestFrame`). A frame that was skipped has no flow of
 its own; the flow from the last frame used to the next one is shared evenly by the control frames between, so that the
 body keeps in step with time. Where more than ``bridge`` frames are missing the rest are jumped over.
+
+Forecasts have a thread of their own (:class:`ForecastThread`), which is handed copies and never waited for.
 """
 
 from __future__ import annotations
@@ -16,6 +18,7 @@ from typing import Any
 from egopose.inference.causal import CausalRegression
 from egopose.inference.stream.body import LiveBody, LivePose
 from egopose.inference.stream.clock import ControlClock
+from egopose.inference.stream.forecasting import ForecastSink, ForecastThread
 from egopose.inference.stream.latency import LatencyTable
 from egopose.inference.stream.memory import MemoryTrace
 from egopose.inference.stream.newest import Captured, NewestFrame
@@ -79,6 +82,7 @@ class LiveLoop:
         latency: where times are kept; the table that ``body`` tells its laps.
         rate: control frames a second.
         settings: see :class:`LoopSettings`.
+        forecasts: beside it, or None.
     """
 
     def __init__(
@@ -90,16 +94,28 @@ class LiveLoop:
         latency: LatencyTable,
         rate: float,
         settings: LoopSettings,
+        forecasts: ForecastThread | None = None,
     ) -> None:
         self._source, self._sight, self._regression, self._body = source, sight, regression, body
-        self._rate, self._settings = rate, settings
+        self._settings, self._forecasts = settings, forecasts
         self._newest, self._clock = NewestFrame(), ControlClock(rate)
         self.latency, self.memory, self.counts = latency, MemoryTrace(), Counts()
         self._frame = -1
         self._began = self._told = time.perf_counter()
 
-    def run(self, on_pose: PoseSink, on_status: StatusSink, stop: threading.Event | None = None) -> dict[str, Any]:
+    def run(
+        self,
+        on_pose: PoseSink,
+        on_status: StatusSink,
+        stop: threading.Event | None = None,
+        on_forecast: ForecastSink = lambda forecast, delay_ms: None,
+    ) -> dict[str, Any]:
         """Until the source ends, the time is over, or ``stop`` is set (by another thread).
+
+        Args:
+            on_pose, on_status: told on the thread that calls.
+            stop: see above.
+            on_forecast: told on the forecasts' thread, for the last time before this returns.
 
         Returns:
             The last status, see :meth:`status`.
@@ -108,10 +124,11 @@ class LiveLoop:
             InputError: the source cannot be read.
         """
         stop = stop or threading.Event()
-        reader = threading.Thread(
-            target=capture, args=(self._source, self._rate, self._newest, stop), name="capture", daemon=True
-        )
+        arguments = (self._source, self._newest, stop)
+        reader = threading.Thread(target=capture, args=arguments, name="capture", daemon=True)
         reader.start()
+        if self._forecasts is not None:
+            self._forecasts.start(on_forecast)
         self._began = self._told = time.perf_counter()
         try:
             while not stop.is_set() and not self._over():
@@ -127,19 +144,29 @@ class LiveLoop:
             self._newest.close()
             # A camera that hangs in its driver must not keep the program: the thread ends with it.
             reader.join(timeout=2.0)
+            if self._forecasts is not None:
+                self._forecasts.close()
         return self.status()
 
     def status(self, last: int | None = None) -> dict[str, Any]:
-        """``seconds`` since the start, the counts, ``dropped`` (late pictures), ``fps`` (pictures used a second),
-        ``stages`` (of the ``last`` frames, see :meth:`LatencyTable.percentiles_ms`) and memory (see
-        :meth:`MemoryTrace.report`)."""
+        """``seconds`` since the start, the counts, ``dropped`` (late pictures), ``reconnects`` and ``broken`` of the
+        source, ``forecasts`` and ``forecasts_skipped``, ``fps`` (pictures used a second), ``stages`` (of the ``last``
+        frames, see :meth:`LatencyTable.percentiles_ms`) and memory (see :meth:`MemoryTrace.report`)."""
         seconds = time.perf_counter() - self._began
+        beside = self._forecasts
+        stages = self.latency.percentiles_ms(last)
+        if beside is not None:
+            stages |= beside.latency.percentiles_ms(None if last is None else max(last // beside.every, 1))
         return {
             "seconds": seconds,
             **vars(self.counts),
             "dropped": self._newest.dropped,
+            "reconnects": self._newest.reconnects,
+            "broken": self._newest.broken,
+            "forecasts": 0 if beside is None else beside.made,
+            "forecasts_skipped": 0 if beside is None else beside.skipped,
             "fps": self.counts.used / max(seconds, 1e-9),
-            "stages": self.latency.percentiles_ms(last),
+            "stages": stages,
             **self.memory.report(),
         }
 
@@ -159,17 +186,18 @@ class LiveLoop:
         self._frame += intervals - steps
         latency = self.latency
         latency.begin()
-        flow = self._sight.flow(captured.image)
+        flow = self._sight.flow(captured.image, captured.time)
         latency.lap("flow")
-        features = self._sight.features(flow, intervals)
+        features = self._sight.features(flow)
         latency.lap("encoder")
         for _ in range(steps):
             self._frame += 1
+            if self._forecasts is not None:
+                self._forecasts.see(self._frame, flow)
             seen = self._regression.push(self._frame, features)
             latency.lap("context")
             if seen is not None:
-                pose = self._body.advance(seen)
-                self._give(pose, on_pose, 1e3 * (time.perf_counter() - captured.arrived))
+                self._give(self._body.advance(seen), on_pose, 1e3 * (time.perf_counter() - captured.arrived))
                 latency.lap("output")
         latency.end(captured.arrived)
 
@@ -180,6 +208,8 @@ class LiveLoop:
     def _give(self, pose: LivePose, on_pose: PoseSink, delay_ms: float) -> None:
         self.counts.poses += 1
         self.counts.resets += pose.reset
+        if self._forecasts is not None:
+            self._forecasts.offer(pose.frame, *self._body.state())
         on_pose(pose, delay_ms)
 
     def _tell(self, on_status: StatusSink) -> None:

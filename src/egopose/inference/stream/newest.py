@@ -30,6 +30,9 @@ class NewestFrame:
 
     Attributes:
         dropped: frames that were never taken because a newer one came.
+        given: frames that came.
+        broken: the source gives nothing and is tried again.
+        reconnects: how often it gave pictures again after that.
     """
 
     def __init__(self) -> None:
@@ -37,13 +40,15 @@ class NewestFrame:
         self._waiting: Captured | None = None
         self._closed = False
         self._error: Exception | None = None
-        self.dropped = 0
+        self.dropped = self.given = self.reconnects = 0
+        self.broken = False
 
     def put(self, frame: Captured) -> None:
         """Replaces what is waiting."""
         with self._changed:
             self.dropped += self._waiting is not None
             self._waiting = frame
+            self.given += 1
             self._changed.notify_all()
 
     def put_patiently(self, frame: Captured) -> None:
@@ -51,6 +56,7 @@ class NewestFrame:
         with self._changed:
             self._changed.wait_for(lambda: self._waiting is None or self._closed)
             self._waiting = frame
+            self.given += 1
             self._changed.notify_all()
 
     def take(self, timeout: float) -> Captured | None:
