@@ -19,7 +19,7 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase, TransformedEnv
 
 from egopose.config import compose_config
-from egopose.data.preparation import store_folder
+from egopose.data.preparation import store_folder, video_of
 from egopose.data.store import TakeStore
 from egopose.envs import build as envs
 from egopose.envs.forecasting import RecurrentStates, TimeLeft
@@ -27,6 +27,7 @@ from egopose.envs.futures import FollowFuture
 from egopose.envs.mdp.observations import humanoid_state
 from egopose.envs.starts import FragmentLike
 from egopose.envs.transformed import TransformedEgoPoseEnv
+from egopose.envs.footing import Footing, LegChain
 from egopose.envs.transforms import RawState, StateNormalizer, TrackingError, VisualContext
 from egopose.errors import InputError
 from egopose.evaluation.report import TakeVideo
@@ -136,6 +137,8 @@ def build_env(
         scale = _state_scale(material, float(config["regressor"]["std_floor"]))
         clip = float(task["tracking_error_clip"])
         transforms.insert(0, TrackingError(material.states, material.takes.following(), scale, clip))
+    if "footing" in config["model"]["inputs"]:
+        transforms.insert(0, Footing(LegChain.of(material.humanoid)))
     if "discriminator" in config.get("algo", ()):
         transforms.insert(0, RawState())
     if forecasts:
@@ -379,8 +382,8 @@ def take_videos(config: Mapping[str, Any]) -> tuple[list[str], list[TakeVideo | 
     """
     store = TakeStore.open(store_folder(config))
     videos = [
-        TakeVideo(store.video(i), take.sync_offset, take.rendered, (take.camera or {}).get("fps"))
-        if store.video(i).is_file()
+        TakeVideo(path, take.sync_offset, take.rendered, (take.camera or {}).get("fps"))
+        if (path := video_of(config, store, i)).is_file()
         else None
         for i, take in enumerate(store.takes)
     ]
