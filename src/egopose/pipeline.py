@@ -22,12 +22,12 @@ from egopose.config import compose_config
 from egopose.data.preparation import store_folder, video_of
 from egopose.data.store import TakeStore
 from egopose.envs import build as envs
+from egopose.envs.footing import Footing, LegChain
 from egopose.envs.forecasting import RecurrentStates, TimeLeft
 from egopose.envs.futures import FollowFuture
 from egopose.envs.mdp.observations import humanoid_state
 from egopose.envs.starts import FragmentLike
 from egopose.envs.transformed import TransformedEgoPoseEnv
-from egopose.envs.footing import Footing, LegChain
 from egopose.envs.transforms import RawState, StateNormalizer, TrackingError, VisualContext
 from egopose.errors import InputError
 from egopose.evaluation.report import TakeVideo

@@ -1,5 +1,7 @@
-"""Where the feet stand and how they move, as an observation: what balance is about, which joint angles tell only through
-the kinematics of the legs."""
+"""Where the feet stand and how they move, as an observation.
+
+Balance is about this, and joint angles tell it only through the kinematics of the legs.
+"""
 
 from __future__ import annotations
 
