@@ -22,7 +22,6 @@ from egopose.config import compose_config
 from egopose.data.preparation import store_folder, video_of
 from egopose.data.store import TakeStore
 from egopose.envs import build as envs
-from egopose.envs.footing import Footing, LegChain
 from egopose.envs.forecasting import RecurrentStates, TimeLeft
 from egopose.envs.futures import FollowFuture
 from egopose.envs.mdp.observations import humanoid_state
@@ -137,8 +136,6 @@ def build_env(
         scale = _state_scale(material, float(config["regressor"]["std_floor"]))
         clip = float(task["tracking_error_clip"])
         transforms.insert(0, TrackingError(material.states, material.takes.following(), scale, clip))
-    if "footing" in config["model"]["inputs"]:
-        transforms.insert(0, Footing(LegChain.of(material.humanoid)))
     if "discriminator" in config.get("algo", ()):
         transforms.insert(0, RawState())
     if forecasts:

@@ -18,7 +18,6 @@ from torchrl.envs import TransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from egopose.envs.env import EgoPoseEnv
-from egopose.envs.footing import Footing
 from egopose.envs.transforms import StateNormalizer, TrackingError
 from egopose.errors import InputError
 from egopose.inference.causal import Seen
@@ -99,7 +98,7 @@ class LiveBody:
         prepare_for_test(env, actor, critic)
         self._base, self._problem, self._physics = base, base.problem, base.physics
         self._actor, self._critic = actor, critic
-        self._transforms = [t for t in env.transform if isinstance(t, TrackingError | Footing | StateNormalizer)]
+        self._transforms = [t for t in env.transform if isinstance(t, TrackingError | StateNormalizer)]
         self._contexts = [live for network in (actor, critic) for live in _make_live(network)]
         self.guard = FailSafe(1, failsafe)
         self._lap = lap
