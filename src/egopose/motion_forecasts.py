@@ -29,8 +29,8 @@ from egopose.material import Material
 from egopose.models.motion_forecast import MotionForecaster
 from egopose.training.baselines import FitSettings, fit
 from egopose.training.checkpoint import ComponentState, RunCheckpoint, metadata_of
-from egopose.training.fragments import Span, cross_fit_blocks, without_block
-from egopose.training.motion_forecast import ForecasterSettings, ForecastLearner, build_forecaster
+from egopose.training.fragments import Span, cross_fit_blocks, group_blocks
+from egopose.training.motion_forecast import ForecasterSettings, ForecastLearner, build_forecaster, cross_fit_starts
 
 if TYPE_CHECKING:
     from egopose.pipeline import Agent
@@ -130,18 +130,17 @@ def _train(config: Mapping[str, Any], material: Material, folder: Path) -> None:
             out.append(learner.model)
         return out
 
+    blocks = cross_fit_blocks(spans, settings.cross_fit)
+    if config["data"]["split"]["kind"] == "subject":
+        blocks = group_blocks(spans, [store.takes[piece.take].subject for piece in pieces], settings.cross_fit)
     whole = members(spans, "")
     coefficients, starts = [], []
-    for fold, block in enumerate(cross_fit_blocks(spans, settings.cross_fit)):
-        others = without_block(spans, block, settings.horizon, settings.context + 2)
-        fitted = members(others, f" without block {fold}")
-        for piece in block:
-            first = next(s.start for s in spans if s.start <= piece.start < s.stop) + settings.context - 1
-            now = torch.arange(min(max(piece.start, first), piece.stop), piece.stop)
-            if len(now):
-                rows = seen[now[:, None] + torch.arange(1 - settings.context, 1)]
-                coefficients.append(_curves(fitted, fitted[0].normalise(rows)))
-                starts.append(now)
+    for fold, (others, now) in enumerate(cross_fit_starts(spans, blocks, settings)):
+        if len(now):
+            fitted = members(others, f" without block {fold}")
+            rows = seen[now[:, None] + torch.arange(1 - settings.context, 1)]
+            coefficients.append(_curves(fitted, fitted[0].normalise(rows)))
+            starts.append(now)
     table = {"coefficients": torch.cat(coefficients), "starts": torch.cat(starts)}
     network = nn.ModuleList(whole)
     part = folder.with_name(f"{FOLDER}.part")

@@ -14,7 +14,7 @@ from egopose.config import from_mapping
 from egopose.errors import InputError
 from egopose.models.motion_forecast import MotionForecaster, spline_basis
 from egopose.models.regressor import state_statistics
-from egopose.training.fragments import Span, split_validation
+from egopose.training.fragments import Span, split_validation, without_block
 
 
 @dataclass(frozen=True)
@@ -28,7 +28,8 @@ class ForecasterSettings:
         std_floor: of the deviations poses are divided by.
         input_noise: deviations added to each context, one draw a number, and as much again a frame.
         other_weight: of the squared error, in deviations, of what E_pose does not see: height, root velocities, hands.
-        cross_fit: forecasters for the training frames, each of which has not seen its own part of them.
+        cross_fit: forecasters for the training frames, each of which has not seen its own part of them: people where
+            people are held out for testing, else blocks of time.
         members: networks whose curves are averaged.
         total_frames: of motion each network learns from, counted as often as they are seen.
     """
@@ -50,6 +51,8 @@ class ForecasterSettings:
     def from_config(cls, values: Mapping[str, Any], source: str = "conf/forecaster") -> ForecasterSettings:
         """Raises InputError: a key is missing, unknown or out of range; names it."""
         settings = from_mapping(cls, values, source)
+        if settings.context > settings.horizon:  # what is left out about a block is as wide as the horizon
+            raise InputError(source, "context", f"must be at most the horizon, {settings.horizon} frames")
         least = {"recurrent": 1, "hidden": 1, "spacing": 1, "context": 1, "horizon": 2, "cross_fit": 2, "members": 1}
         for name, value in least.items():
             if getattr(settings, name) < value:
@@ -65,6 +68,31 @@ def build_forecaster(
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         return MotionForecaster(mean, std, settings.recurrent, settings.hidden, settings.dropout, count)
+
+
+def cross_fit_starts(
+    spans: Sequence[Span], blocks: Sequence[Sequence[Span]], settings: ForecasterSettings
+) -> list[tuple[list[Span], Tensor]]:
+    """For each block, what its networks learn from and the frames ``[N]`` whose forecasts they make.
+
+    Together these are every frame with a context behind it. Networks learn from no frame of their forecasts' contexts
+    and futures.
+
+    Args:
+        spans: takes' training frames.
+        blocks: share them out; at most one stretch of each span in a block.
+        settings: for context and horizon.
+    """
+    out = []
+    for block in blocks:
+        others = without_block(spans, block, settings.horizon, settings.context + 2)
+        starts = [torch.zeros(0, dtype=torch.int64)]
+        for piece in block:
+            begin = next(s.start for s in spans if s.start <= piece.start < s.stop)
+            first = min(max(piece.start, begin + settings.context - 1), piece.stop)
+            starts.append(torch.arange(first, piece.stop))
+        out.append((others, torch.cat(starts)))
+    return out
 
 
 class ForecastLearner:
