@@ -103,6 +103,7 @@ def run_evaluation(
         "command": shlex.join(sys.orig_argv),
         "checkpoints": [str(agent.path) for agent in agents],
         "split": split,
+        "corruption": agents[0].config.get("corruption"),
         "rendered_video": rendered,
         "settings": {key: config[key] for key in ("failsafe", "contact", "interval", "survival")},
         "survival": survival,
@@ -169,15 +170,19 @@ def physics_group(name: str | None) -> dict[str, Any] | None:
 def main(config: DictConfig) -> None:
     """Hydra's entry."""
     from egopose.pipeline import load_agent, take_videos
+    from egopose.vision.corruption import Corruption
 
     try:
         values = resolved(config)
         given = values["checkpoint"]
         paths = [str(p) for p in given] if isinstance(given, list) else [str(given)]
-        overrides = physics_group(values["physics"])
+        overrides = physics_group(values["physics"]) or {}
+        overrides |= {"corruption": values["corruption"]} if "corruption" in values else {}
         agents = [load_agent(path, which=str(values["which"]), overrides=overrides) for path in paths]
         names, videos = take_videos(agents[0].config)
-        out = output_folder(values["out"], agents[0].path, str(values["split"]))
+        spoilt = Corruption.from_config(values) is not None
+        part = f"{values['split']}-corrupted" if spoilt else str(values["split"])
+        out = output_folder(values["out"], agents[0].path, part)
         if agents[0].config["task"]["name"] == "forecasting":
             from egopose.forecast_evaluation import run_forecast_evaluation
 

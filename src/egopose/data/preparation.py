@@ -25,6 +25,7 @@ from egopose.humanoid.model import HumanoidModel, build_humanoid
 from egopose.motion.io import read_motion
 from egopose.motion.motion import Motion
 from egopose.motion.retarget import RetargetReport
+from egopose.vision.corruption import Corruption
 from egopose.vision.flow import FlowConfig
 from egopose.vision.lens import Camera
 
@@ -162,19 +163,25 @@ def _row(
 def _make_videos(config: Mapping[str, Any], store: TakeStore, progress: bool) -> None:
     from egopose.vision.takes import RenderConfig, RenderJob, render_takes
 
+    corruption = Corruption.from_config(config)
     todo = [i for i, take in enumerate(store.takes) if take.rendered]
+    if corruption is not None and len(todo) < len(store.takes):
+        filmed = next(take.name for take in store.takes if not take.rendered)
+        raise InputError("configuration", "corruption", f"is for rendered takes; the video of {filmed} was filmed")
     if not todo:
         return
     tests = _test_room_takes(config, store)
     # At the default rates, so that a video stays valid whatever rate is trained at.
     xml = build_humanoid(HumanoidConfig.from_mapping(config["humanoid"])).xml
     jobs = [
-        RenderJob(t.name, xml, store.clip(i).qpos, store.video(i), "test" if i in tests else "train")
+        RenderJob(t.name, xml, store.clip(i).qpos, video_of(config, store, i), "test" if i in tests else "train")
         for i in todo
         for t in [store.takes[i]]
     ]
+    for folder in {job.path.parent for job in jobs}:
+        folder.mkdir(parents=True, exist_ok=True)
     vision = config["vision"]
-    render_takes(jobs, RenderConfig.from_mapping(vision), int(vision["workers"]), progress)
+    render_takes(jobs, RenderConfig.from_mapping(vision, corruption), int(vision["workers"]), progress)
 
 
 def _test_room_takes(config: Mapping[str, Any], store: TakeStore) -> set[int]:
@@ -186,12 +193,23 @@ def _test_room_takes(config: Mapping[str, Any], store: TakeStore) -> set[int]:
     return {i for i, take in enumerate(store.takes) if take.subject in tests}
 
 
+def video_of(config: Mapping[str, Any], store: TakeStore, take: int) -> Path:
+    """The wearer's video as ``config`` has it: the store's, or a corrupted one beside it."""
+    corruption, usual = Corruption.from_config(config), store.video(take)
+    if corruption is None:
+        return usual
+    digest = hashlib.sha256(json.dumps(asdict(corruption), sort_keys=True).encode()).hexdigest()
+    return usual.parent / f"corrupted-{digest[:8]}" / usual.name
+
+
 def flow_name(config: Mapping[str, Any]) -> str:
     """The flow table's name: the vision config's kind and what the flow depends on."""
     vision = config["vision"]
     parts = [vision["flow"]["preset"], vision["flow"]["working_size"], vision["flow"]["stored_size"]]
     rendered = [vision["video"], vision["camera"], vision["room"], config["data"]["split"].get("test_subjects")]
-    digest = hashlib.sha256(json.dumps([parts, rendered], sort_keys=True, default=str).encode()).hexdigest()
+    corruption = Corruption.from_config(config)
+    known = [parts, rendered, *([asdict(corruption)] if corruption is not None else [])]
+    digest = hashlib.sha256(json.dumps(known, sort_keys=True, default=str).encode()).hexdigest()
     return f"{parts[0]}-{parts[2]}-{digest[:8]}"
 
 
@@ -206,7 +224,8 @@ def _make_flow(config: Mapping[str, Any], store: TakeStore, progress: bool) -> N
         for index in todo:
             take = store.takes[index]
             camera = Camera.from_mapping(take.camera, take.name) if take.camera else None
-            flow = extract_flow(store.video(index), settings, store.fps, take.sync_offset, take.length, camera)
+            video = video_of(config, store, index)
+            flow = extract_flow(video, settings, store.fps, take.sync_offset, take.length, camera)
             table[store.frames(index)] = torch.from_numpy(flow)
             store.mark_flow(name, index)
             bar.advance(task, take.length)

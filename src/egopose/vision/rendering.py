@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from egopose.motion.rotations import Array, from_axis_angle, from_scipy, multiply, to_scipy
+from egopose.vision.corruption import Corruption
 from egopose.vision.gl import open_context
 from egopose.vision.rooms import Range, RoomConfig, draw_room, furnish
 from egopose.vision.video import Frame, write_video
@@ -173,6 +174,7 @@ def wearer_frames(
     camera: CameraConfig,
     size: int,
     fps: float,
+    corruption: Corruption | None = None,
 ) -> Iterator[Frame]:
     """What the wearer's head camera sees, frame by frame.
 
@@ -184,6 +186,7 @@ def wearer_frames(
         room, camera: ranges.
         size: side of the square pictures, pixels.
         fps: frames per second.
+        corruption: what is wrong with the video.
 
     Raises:
         ValueError: no frames, or the model has no camera ``head`` or another number of coordinates.
@@ -204,13 +207,17 @@ def wearer_frames(
         raise ValueError(f"qpos has {qpos.shape[1]} coordinates, the model {model.nq}")
     rng = np.random.default_rng([take_seed, 2])
     worn = WearerCamera.draw(rng, camera)
-    orientations = camera_orientations(model, worn.angles(rng, len(qpos), fps))
+    angles, shown = worn.angles(rng, len(qpos), fps), np.arange(len(qpos))
+    if corruption is not None:
+        wrong = corruption.generator(take_seed)
+        angles, shown = angles + corruption.angles(wrong, len(qpos), fps), corruption.shown(wrong, len(qpos))
+    orientations = camera_orientations(model, angles)
     with SceneRenderer(model, size, size) as renderer:
         index = model.camera(WEARER_CAMERA).id
         renderer.model.cam_fovy[index] = worn.field_of_view
-        for pose, orientation in zip(qpos, orientations, strict=True):
-            renderer.model.cam_quat[index] = orientation
-            yield renderer.render(pose, WEARER_CAMERA)
+        for frame in shown:
+            renderer.model.cam_quat[index] = orientations[frame]
+            yield renderer.render(qpos[frame], WEARER_CAMERA)
 
 
 def render_wearer_video(
@@ -224,10 +231,19 @@ def render_wearer_video(
     camera: CameraConfig,
     size: int,
     fps: float,
+    corruption: Corruption | None = None,
 ) -> None:
     """Write :func:`wearer_frames` to an MP4, whole or not at all. Raises as it and as ``VideoWriter``."""
     frames = wearer_frames(
-        model_xml, qpos, room_seed=room_seed, take_seed=take_seed, room=room, camera=camera, size=size, fps=fps
+        model_xml,
+        qpos,
+        room_seed=room_seed,
+        take_seed=take_seed,
+        room=room,
+        camera=camera,
+        size=size,
+        fps=fps,
+        corruption=corruption,
     )
     write_video(path, frames, fps)
 

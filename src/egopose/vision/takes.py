@@ -16,6 +16,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from egopose.errors import InputError
 from egopose.motion.rotations import Array
 from egopose.untrusted import read_json
+from egopose.vision.corruption import Corruption
 from egopose.vision.gl import choose_backend
 from egopose.vision.rendering import CameraConfig, render_wearer_video
 from egopose.vision.rooms import RoomConfig, room_seed
@@ -29,9 +30,10 @@ class RenderConfig:
     fps: float
     room: RoomConfig
     camera: CameraConfig
+    corruption: Corruption | None = None
 
     @classmethod
-    def from_mapping(cls, cfg: Mapping[str, Any]) -> RenderConfig:
+    def from_mapping(cls, cfg: Mapping[str, Any], corruption: Corruption | None = None) -> RenderConfig:
         """From the config group ``vision``.
 
         Raises:
@@ -40,7 +42,7 @@ class RenderConfig:
         try:
             room, camera = ({k: _plain(v) for k, v in cfg[group].items()} for group in ("room", "camera"))
             size, fps = int(cfg["video"]["size"]), float(cfg["video"]["fps"])
-            return cls(size, fps, RoomConfig(**room), CameraConfig(**camera))
+            return cls(size, fps, RoomConfig(**room), CameraConfig(**camera), corruption)
         except (KeyError, TypeError, ValueError) as error:
             raise InputError("conf/vision", "video, room, camera", f"{error}") from error
 
@@ -75,7 +77,9 @@ class RenderJob:
 def job_fingerprint(job: RenderJob, config: RenderConfig) -> str:
     """Changes with whatever changes the video."""
     digest = hashlib.sha256()
-    settings = json.dumps([job.name, job.split, asdict(config)], sort_keys=True)
+    # Videos from before there were corruptions stay valid.
+    known = {key: value for key, value in asdict(config).items() if key != "corruption" or value is not None}
+    settings = json.dumps([job.name, job.split, known], sort_keys=True)
     for part in (settings.encode(), job.model_xml.encode(), job.qpos.tobytes()):
         digest.update(hashlib.sha256(part).digest())
     return digest.hexdigest()
@@ -113,6 +117,7 @@ def render_take(job: RenderJob, config: RenderConfig) -> int:
         camera=config.camera,
         size=config.size,
         fps=config.fps,
+        corruption=config.corruption,
     )
     record = {"fingerprint": job_fingerprint(job, config), "take": job.name, "split": job.split, "room": seed}
     _record(job.path).write_text(json.dumps({**record, "frames": len(job.qpos), "rendered": True}, indent=1))

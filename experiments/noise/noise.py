@@ -1,0 +1,180 @@
+"""Judges trained runs on clean and on corrupted video: raw results for table.py.
+
+    python experiments/noise/noise.py RUN [RUN ...] [--corruptions jitter drift] [--workers 1] [--results DIR]
+
+A run is a directory of `egopose train` (ours, VGAIL) or of `egopose baseline baseline=path_pose`; each policy's run
+brings its PoseReg along. Corruptions are those of conf/corruption; the wearer's videos are rendered anew for each, once
+a store. What has been judged is not judged again. To train on corrupted video: `egopose train ... corruption=jitter`.
+"""
+
+from __future__ import annotations
+
+from egopose.runtime import prepare_runtime
+
+prepare_runtime()
+
+import argparse  # noqa: E402
+import json  # noqa: E402
+import os  # noqa: E402
+import sys  # noqa: E402
+from collections.abc import Mapping, Sequence  # noqa: E402
+from pathlib import Path  # noqa: E402
+from typing import Any  # noqa: E402
+
+import torch  # noqa: E402
+
+from egopose.baselines import load_baseline, path_pose_motion  # noqa: E402
+from egopose.config import compose_config, from_mapping  # noqa: E402
+from egopose.data.preparation import flow_name, store_folder  # noqa: E402
+from egopose.data.store import TakeStore  # noqa: E402
+from egopose.errors import InputError  # noqa: E402
+from egopose.evaluation.agents import evaluate_agent  # noqa: E402
+from egopose.evaluation.protocols import METRICS, ContactSettings, TakeScores, score_take  # noqa: E402
+from egopose.evaluation.tables import write_json  # noqa: E402
+from egopose.inference.failsafe import FailSafeSettings  # noqa: E402
+from egopose.material import run_material  # noqa: E402
+from egopose.models.baselines.path_pose import PathPose  # noqa: E402
+from egopose.pipeline import load_agent  # noqa: E402
+from egopose.untrusted import read_yaml  # noqa: E402
+from egopose.vision.corruption import Corruption  # noqa: E402
+
+HERE = Path(__file__).resolve().parent
+CORRUPTIONS = ("none", "jitter", "drift", "shake", "dropped", "all")
+Result = dict[str, Any]
+
+
+def method_of(config: Mapping[str, Any]) -> str:
+    """The method a run directory's ``config.yaml`` is of.
+
+    Raises:
+        InputError: it is of none that estimates.
+    """
+    if "baseline" in config:
+        if config["baseline"].get("kind") != "path_pose":
+            raise InputError("run", "baseline.kind", f"is {config['baseline'].get('kind')!r}, which estimates nothing")
+        return "pathpose"
+    if config["task"].get("context") is not None:
+        raise InputError("run", "task", "this run forecasts; the noise study is of estimation")
+    return "vgail" if "discriminator" in config["algo"] else "ours"
+
+
+def judge(run: Path, config: Mapping[str, Any], corruption: Mapping[str, Any]) -> dict[str, Result]:
+    """Figures by method on the test fragments, seen through ``corruption`` (a group of conf/corruption)."""
+    settings = compose_config("evaluate", ["checkpoint=none"])
+    contact = from_mapping(ContactSettings, settings["contact"], "conf/evaluate.yaml: contact")
+    if method_of(config) == "pathpose":
+        return {"pathpose": _path_pose(run, {**config, "corruption": corruption}, contact)}
+    # Not the best: which that is, is decided on test fragments while training.
+    overrides = {"corruption": corruption, "vision": config["vision"]}
+    agent = load_agent(run, which="latest", overrides=overrides)
+    fragments = list(agent.material.test)
+    labels = _labels(agent.config, fragments)
+    failsafe = from_mapping(FailSafeSettings, settings["failsafe"], "conf/evaluate.yaml: failsafe")
+    found = evaluate_agent(agent, fragments, labels, "test", failsafe, contact, int(settings["threads"]))
+    return {
+        method_of(config): _figures([one.scores for one in found]),
+        "posereg": _figures([one.pose_regression_scores for one in found]),
+    }
+
+
+def _path_pose(run: Path, config: Mapping[str, Any], contact: ContactSettings) -> Result:
+    material, model = run_material(config, run), load_baseline(run).model
+    assert isinstance(model, PathPose)
+    flow = TakeStore.open(store_folder(config)).flow(flow_name(config))
+    truth, offsets = torch.as_tensor(material.reference["qpos"]).double().numpy(), material.takes.offsets.tolist()
+    scores = []
+    for fragment, label in zip(material.test, _labels(config, material.test), strict=True):
+        motion = path_pose_motion(model, flow, material, fragment, label)
+        first = offsets[fragment.take] + fragment.start
+        scores.append(score_take(label, motion.qpos, truth[first : first + len(motion)], material.humanoid, contact))
+    return _figures(scores)
+
+
+def _labels(config: Mapping[str, Any], fragments: Sequence[Any]) -> list[str]:
+    takes = TakeStore.open(store_folder(config)).takes
+    return [f"{takes[f.take].name}_{f.start}-{f.stop}" for f in fragments]
+
+
+def _figures(scores: Sequence[TakeScores]) -> Result:
+    return {
+        "takes": [one.name for one in scores],
+        "figures": {m.key: [m.scale * one.figure(m.key) for one in scores] for m in METRICS},
+        "resets": [one.resets for one in scores],
+        "frames": [len(one.frames["E_pose"]) for one in scores],
+    }
+
+
+def judge_all(runs: Sequence[Path], corruptions: Sequence[str], results: Path, workers: int | None = None) -> None:
+    """Write ``results/raw/METHOD-FOLD-trained_WITH-seedK-CORRUPTION.json`` for what is not there yet.
+
+    ``workers``: processes that render; None for as many as the run's configuration says.
+
+    Raises:
+        InputError: a run or corruption cannot be used.
+    """
+    for run in runs:
+        config = read_yaml(run / "config.yaml", "config")
+        if workers is not None:
+            config["vision"]["workers"] = workers
+        method, trained = method_of(config), _name_of(config.get("corruption"))
+        methods = [method] if method == "pathpose" else [method, "posereg"]
+        fold = _fold(config["data"]["split"])
+        for name in corruptions:
+            corruption = compose_config("prepare", [f"corruption={name}"])["corruption"]
+            places = {
+                one: results / "raw" / f"{one}-{fold}-trained_{trained}-seed{config['seed']}-{name}.json"
+                for one in methods
+            }
+            if all(_is_done(place, corruption, run) for place in places.values()):
+                continue
+            print(f"{method}: {run} on {name}", flush=True)
+            for one, found in judge(run, config, corruption).items():
+                about = {"method": one, "fold": fold, "trained": trained, "seed": config["seed"], "corruption": name}
+                place = places[one]
+                place.parent.mkdir(parents=True, exist_ok=True)
+                part = place.with_suffix(".part")
+                write_json(part, {**about, "settings": corruption, "run": run.resolve().name, **found})
+                os.replace(part, place)
+
+
+def _is_done(place: Path, corruption: Mapping[str, Any], run: Path) -> bool:
+    try:
+        found = json.loads(place.read_text())
+        return bool(found["settings"] == corruption and found["run"] == run.resolve().name)
+    except (OSError, ValueError, KeyError, TypeError):
+        return False
+
+
+def _name_of(corruption: Mapping[str, Any] | None) -> str:
+    """The group of conf/corruption with these settings; ``other`` for settings of one's own."""
+    if Corruption.from_config({"corruption": corruption}) is None:
+        return "clean"
+    groups = (
+        name for name in CORRUPTIONS if compose_config("prepare", [f"corruption={name}"])["corruption"] == corruption
+    )
+    return next(groups, "other")
+
+
+def _fold(split: Mapping[str, Any]) -> str:
+    if split["kind"] == "time":
+        return "subject" + "_".join(map(str, split.get("subjects") or ["s_all"]))
+    return "without" + "_".join(map(str, split["test_subjects"]))
+
+
+def main() -> None:
+    """The command."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("runs", nargs="+", type=Path)
+    parser.add_argument("--corruptions", nargs="+", choices=CORRUPTIONS, default=CORRUPTIONS)
+    parser.add_argument("--workers", type=int)
+    parser.add_argument("--results", type=Path, default=HERE)
+    options = parser.parse_args()
+    try:
+        judge_all(options.runs, options.corruptions, options.results, options.workers)
+    except InputError as error:
+        print(f"error: {error}", file=sys.stderr)
+        raise SystemExit(2) from None
+
+
+if __name__ == "__main__":
+    main()
