@@ -10,12 +10,15 @@ import pytest
 from test_forecasting_training import configuration as forecasting_configuration
 from test_forecasting_training import forecasting_material
 from test_training_pipeline import assert_equal, configuration, estimation_material
+from torchrl.render import RenderConfig, render_policy
 
 from egopose import pipeline
 from egopose.errors import InputError
 from egopose.evaluation.survival import frames_survived
 from egopose.evaluators import BackgroundSurvival, checkpoint_evaluator
 from egopose.material import Material
+from egopose.torchrl_render import make_env, make_policy
+from egopose.training.checkpoint import find_checkpoint
 from egopose.training.logging import CsvCurves
 from egopose.training.loop import Run, train
 
@@ -124,3 +127,25 @@ def test_a_lost_process_is_told_and_training_goes_on(tmp_path: Path) -> None:
     with pytest.warns(UserWarning, match="lost its process"):
         assert train(run, [], background).iteration == 2
     background.close()
+
+
+def test_torchrl_renders_a_checkpoint(estimating: tuple[Path, Material], tmp_path: Path) -> None:
+    folder, material = estimating
+    config = RenderConfig(
+        ckpt=find_checkpoint(folder),
+        env=lambda config: make_env(config, 64, material),
+        policy=lambda ckpt_path: make_policy(ckpt_path, material),
+        format="npz",
+        max_steps=4,
+        out=tmp_path / "rollout.npz",
+    )
+    try:
+        result = render_policy(config)
+    except RuntimeError as error:
+        pytest.skip(f"no OpenGL here: {error}")
+    assert result.warnings == []
+    assert (tmp_path / "rollout.npz").is_file()
+    (frames,) = result.frames
+    pictures = [next(iter(bundle.frames.values())) for bundle in frames]
+    assert {picture.shape for picture in pictures} == {(64, 64, 3)}
+    assert all((picture != pictures[0]).any() for picture in pictures[1:])
