@@ -86,12 +86,13 @@ def run_training(
 @contextmanager
 def _evaluation(run: Run, material: Material) -> Iterator[Evaluation | BackgroundEvaluation]:
     """As ``training.evaluate_async`` says: between iterations, or beside them."""
-    from egopose.evaluators import BackgroundSurvival
-    from egopose.pipeline import build_evaluation
-
     if not run.config["training"].get("evaluate_async") or not run.settings.evaluate_every:
+        from egopose.pipeline import build_evaluation
+
         yield build_evaluation(run, material)
         return
+    from egopose.evaluators import BackgroundSurvival
+
     background = BackgroundSurvival(run, material)
     try:
         yield background
