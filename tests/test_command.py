@@ -3,10 +3,15 @@
 from __future__ import annotations
 
 import importlib.util
+import re
+import subprocess
+import sys
 
 import pytest
 
 from egopose.__main__ import VERBS, main
+from egopose.config import compose_config
+from egopose.errors import InputError
 
 
 def call(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
@@ -26,6 +31,35 @@ def test_help_lists_every_verb(monkeypatch, capsys) -> None:
 def test_an_unknown_verb_is_named(monkeypatch, capsys) -> None:
     assert call(monkeypatch, "fly") == 2
     assert "'fly'" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("override", "said"),
+    [
+        ("training.max_second=3", "training.max_second: is not a setting; did you mean training.max_seconds?"),
+        ("walks.count=3", "walks.count: is not a setting; the file lists them"),
+        ("sim=fats", "sim: there is no 'fats'; there are fast, paper"),
+        ("walk.bvh", "walk.bvh: cannot be read: settings are given as key=value"),
+    ],
+)
+def test_a_slip_in_a_setting_is_told_with_what_there_is(override: str, said: str) -> None:
+    with pytest.raises(InputError, match=re.escape(said)):
+        compose_config("train", [override])
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["train", "training.max_second=3"], "did you mean training.max_seconds?"),
+        (["sync", "video=walk.mp4"], "motion: is missing; give motion=..."),
+    ],
+)
+def test_the_command_tells_it_in_one_line(words: list[str], said: str) -> None:
+    done = subprocess.run([sys.executable, "-m", "egopose", *words], capture_output=True, text=True, timeout=120)
+    assert done.returncode == 2
+    (line,) = done.stderr.splitlines()
+    assert line.startswith("error: ")
+    assert line.endswith(said)
 
 
 @pytest.mark.parametrize("verb", VERBS)

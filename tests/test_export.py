@@ -325,6 +325,10 @@ def test_the_command_line(
     with pytest.raises(SystemExit):
         main()
     assert "says no file" in capsys.readouterr().err
+    whole = (tmp_path / "a.bvh").read_bytes()
+    with pytest.raises(InputError, match="the motion itself"):
+        run_export(tmp_path / "a.bvh", [str(tmp_path / "../" / tmp_path.name / "a.bvh")], compose_config("export"))
+    assert (tmp_path / "a.bvh").read_bytes() == whole
 
 
 def test_a_body_of_unknown_masses_gets_no_forces(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -83,6 +83,13 @@ def candidates(line: str, verbs: list[str]) -> list[str]:
     return sorted({m[: m.find(".", len(word)) + 1] or m for m in matching})
 
 
+def setting_names(verb: str) -> list[str]:
+    """All settings and groups of ``conf/VERB.yaml``, as they are given on the command line."""
+    folder = config_dir()
+    groups = _groups(folder, verb)
+    return sorted({*groups, *(key.rstrip("=") for key in _settings(folder, verb, groups))})
+
+
 def _options(verb: str) -> list[str]:
     """Of a verb that reads its command with argparse."""
     parser = importlib.import_module(f"egopose.{verb}").command_line()

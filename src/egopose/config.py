@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import difflib
+import os
 import re
 import sys
 import types
 import typing
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import MISSING, fields
 from datetime import datetime
 from functools import wraps
@@ -17,9 +20,9 @@ import hydra
 from hydra import compose, initialize_config_dir
 from hydra._internal.utils import get_args_parser
 from hydra.core.global_hydra import GlobalHydra
-from hydra.errors import HydraException
+from hydra.errors import HydraException, OverrideParseException
 from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import OmegaConfBaseException
+from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
 from egopose.errors import InputError
 
@@ -49,6 +52,8 @@ def resolved(config: DictConfig) -> dict[str, Any]:
         out = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
     except OmegaConfBaseException as error:
         field = str(getattr(error, "full_key", "") or "?")
+        if isinstance(error, MissingMandatoryValue):
+            raise InputError("command line", field, f"is missing; give {field}=...") from None
         raise InputError("configuration", field, str(error).splitlines()[0]) from None
     if not isinstance(out, dict):
         raise InputError("configuration", "top level", "must be a mapping")
@@ -124,9 +129,32 @@ def compose_config(name: str, overrides: Sequence[str] = ()) -> dict[str, Any]:
         with initialize_config_dir(str(config_dir()), version_base="1.3"):
             return resolved(compose(name, list(overrides)))
     except HydraException as error:
-        raise InputError(f"conf/{name}.yaml", "override", str(error).splitlines()[0]) from None
+        raise explained(name, error) from None
     finally:
         GlobalHydra.instance().hydra = running
+
+
+def explained(name: str, error: HydraException) -> InputError:
+    """What Hydra says of a command line for ``conf/NAME.yaml``, in one line that says what to do."""
+    from egopose.completion import setting_names
+
+    said = str(error)
+    source = f"conf/{name}.yaml"
+    if key := re.search(r"Could not override '([^']+)'", said):
+        near = difflib.get_close_matches(key[1], setting_names(name), 1, 0.8)
+        meant = f"; did you mean {near[0]}?" if near else ""
+        return InputError(
+            source, key[1], f"is not a setting{meant or f'; the file lists them: {config_dir() / name}.yaml'}"
+        )
+    if choice := re.search(r"Could not find '([^']+)/([^'/]+)'", said):
+        # Hydra lists them, those of --config-dir too.
+        _, _, listed = said.partition("Available options in")
+        there = ", ".join(line.strip() for line in listed.splitlines() if line.startswith("\t"))
+        return InputError(source, choice[1], f"there is no {choice[2]!r}; there are {there or 'none'}")
+    if isinstance(error, OverrideParseException):
+        cause = "cannot be read: settings are given as key=value, quoted where the shell needs it"
+        return InputError(source, error.override, cause)
+    return InputError(source, "override", said.splitlines()[0])
 
 
 def check_arguments(arguments: Sequence[str]) -> None:
@@ -150,20 +178,32 @@ def check_arguments(arguments: Sequence[str]) -> None:
             check_config_folder(Path(folder))
 
 
+@contextmanager
+def faults_told(name: str) -> Iterator[None]:
+    """For a main on ``conf/NAME.yaml``: what was given wrong ends in one line and exit code 2."""
+    # Hydra itself would print a page on a slip of the pen, and of a fault of ours hide where it is.
+    os.environ.setdefault("HYDRA_FULL_ERROR", "1")
+    try:
+        yield
+    except InputError as error:
+        print(f"error: {error}", file=sys.stderr)
+        raise SystemExit(2) from None
+    except HydraException as error:
+        print(f"error: {explained(name, error)}", file=sys.stderr)
+        raise SystemExit(2) from None
+
+
 def command(name: str) -> Callable[[Callable[[DictConfig], None]], Callable[[], None]]:
-    """``hydra.main`` on ``conf/NAME.yaml`` behind :func:`check_arguments`; an InputError ends with its one line."""
+    """``hydra.main`` on ``conf/NAME.yaml`` behind :func:`check_arguments`; what was given wrong ends in one line."""
 
     def decorate(function: Callable[[DictConfig], None]) -> Callable[[], None]:
         entry = hydra.main(version_base="1.3", config_path=str(config_dir()), config_name=name)(function)
 
         @wraps(function)
         def main() -> None:
-            try:
+            with faults_told(name):
                 check_arguments(sys.argv[1:])
-            except InputError as error:
-                print(f"error: {error}", file=sys.stderr)
-                raise SystemExit(2) from None
-            entry()
+                entry()
 
         return main
 

@@ -65,6 +65,8 @@ def run_export(source: Path, files: Sequence[str], config: Mapping[str, Any]) ->
             motion = _with_forces(motion, source, config, required=needed or enabled is True)
         for file, suffix in suffixes.items():
             target = Path(file.replace("{take}", take))
+            if target.exists() and target.samefile(path):
+                raise InputError(target, "to", "is the motion itself, which stays as it is; give another name")
             target.parent.mkdir(parents=True, exist_ok=True)
             try:
                 write_motion(motion, target, **{k: v for k, v in options.items() if k in _keywords(suffix)})

@@ -48,7 +48,8 @@ def run_report(folder: Path, overrides: Sequence[str] = ()) -> Path:
     from egopose.export import humanoid_for
 
     if not folder.is_dir():
-        raise InputError(folder, "path", "no such folder")
+        cause = "is a file; give the folder of an evaluation or a sweep" if folder.exists() else "no such folder"
+        raise InputError(folder, "path", cause)
     if (folder / "results.json").is_file():
         try:
             humanoid = humanoid_for(folder, "default")

@@ -18,7 +18,7 @@ from hydra.core.hydra_config import HydraConfig  # noqa: E402
 from hydra.types import RunMode  # noqa: E402
 from omegaconf import DictConfig  # noqa: E402
 
-from egopose.config import check_arguments, config_dir, register_resolvers, resolved  # noqa: E402
+from egopose.config import check_arguments, config_dir, faults_told, register_resolvers, resolved  # noqa: E402
 from egopose.errors import InputError  # noqa: E402
 
 if TYPE_CHECKING:
@@ -154,11 +154,8 @@ def hydra_main(config: DictConfig) -> float:
 
 def main() -> None:
     """The command. A run directory that is not there is refused before Hydra would make it."""
-    try:
+    with faults_told("train"):
         check_arguments(sys.argv[1:])
-    except InputError as error:
-        print(f"error: {error}", file=sys.stderr)
-        raise SystemExit(2) from None
     for word in sys.argv[1:]:
         name, _, value = word.partition("=")
         if name != "resume" or value in ("", "null"):
@@ -169,7 +166,8 @@ def main() -> None:
         if not (Path(value) / "config.yaml").is_file() and not (Path(value) / "checkpoints").is_dir():
             print(f"error: {value}: config.yaml: is missing: this is no run directory", file=sys.stderr)
             raise SystemExit(2)
-    hydra_main()
+    with faults_told("train"):
+        hydra_main()
 
 
 if __name__ == "__main__":

@@ -32,7 +32,10 @@ _LIVE = ("ws://", "wss://")
 
 def _offset(word: str) -> float | None:
     """Seconds; None for one that is to be found."""
-    return None if word == "auto" else float(word)
+    try:
+        return None if word == "auto" else float(word)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"must be seconds or `auto`, not {word!r}") from None
 
 
 def _is_source(word: str) -> bool:

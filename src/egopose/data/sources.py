@@ -164,7 +164,11 @@ def _listed(rows: Any, reader: dict[str, Any], camera: dict[str, Any]) -> list[T
             )
         )
     if not out:
-        raise InputError("data", "takes", "the list is empty")
+        raise InputError(
+            "data",
+            "takes",
+            "the list is empty; give data.takes=[{motion: FILE}], or a file of takes as docs/own-data.md shows",
+        )
     return out
 
 
