@@ -7,7 +7,15 @@ from pathlib import Path
 
 import pytest
 
+from egopose.runtime import prefer_quick_products
+
 SHARED = Path(__file__).resolve().parents[1].parent / "shared"
+
+
+@pytest.fixture(scope="session", autouse=True)
+def one_way_of_multiplying() -> None:
+    """Training chooses it for the process: results to the bit must not depend on the tests that ran before."""
+    prefer_quick_products()
 
 
 @pytest.fixture(scope="session")

@@ -47,7 +47,9 @@ class CollectorSettings:
         threads: torch threads while collecting; physics has threads of its own.
         update_threads: torch threads while the networks are updated.
         lanes: parts of the worlds of ``sync`` that take turns, see :class:`egopose.training.lanes.LaneCollector`; 1 to
-            step all at once.
+            step all at once, None for two from ``lanes_from`` steps of physics a control step on: below, taking turns
+            costs more than it hides.
+        lanes_from: see ``lanes``.
         address: of the Ray cluster, see :class:`egopose.training.workers.Workers`.
     """
 
@@ -57,7 +59,8 @@ class CollectorSettings:
     workers: int
     threads: int
     update_threads: int
-    lanes: int = 1
+    lanes: int | None = 1
+    lanes_from: int = 8
     address: str | None = None
 
     @classmethod
@@ -66,10 +69,10 @@ class CollectorSettings:
         settings = from_mapping(cls, values, source)
         if settings.kind not in KINDS:
             raise InputError(source, "kind", f"must be one of {', '.join(KINDS)}, not {settings.kind!r}")
-        for name in ("worlds", "physics_threads", "workers", "threads", "update_threads", "lanes"):
-            if getattr(settings, name) < 1:
-                raise InputError(source, name, f"must be at least 1, not {getattr(settings, name)}")
-        if settings.lanes > settings.worlds:
+        for name in ("worlds", "physics_threads", "workers", "threads", "update_threads", "lanes", "lanes_from"):
+            if (value := getattr(settings, name)) is not None and value < 1:
+                raise InputError(source, name, f"must be at least 1, not {value}")
+        if settings.lanes is not None and settings.lanes > settings.worlds:
             raise InputError(source, "lanes", f"must be at most the worlds, {settings.worlds}, not {settings.lanes}")
         return settings
 
@@ -94,7 +97,10 @@ def build_collector(
         if isinstance(env, TransformedEgoPoseEnv):
             env.defer_rewards()
             if isinstance(acting, GaussianSampler) and acting.draws_from_entries():
-                collector = partial(LaneCollector, lanes=settings.lanes)
+                lanes = settings.lanes or min(
+                    settings.worlds, 1 + (env.base_env.physics.substeps >= settings.lanes_from)
+                )
+                collector = partial(LaneCollector, lanes=lanes)
         return collector(
             env,
             acting,
