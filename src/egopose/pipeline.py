@@ -22,6 +22,7 @@ from egopose.config import compose_config
 from egopose.data.preparation import store_folder, video_of
 from egopose.data.store import TakeStore
 from egopose.envs import build as envs
+from egopose.envs.aids import Aids
 from egopose.envs.forecasting import RecurrentStates, TimeLeft
 from egopose.envs.futures import FollowFuture
 from egopose.envs.mdp.observations import humanoid_state
@@ -39,6 +40,7 @@ from egopose.runtime import settle_heap
 from egopose.training.adversarial import AdversarialPPO, DiscriminatorSettings
 from egopose.training.checkpoint import RunCheckpoint, find_checkpoint, read_json, require, verify
 from egopose.training.collectors import CollectorSettings, build_collector, transform_state
+from egopose.training.exploration import SigmaSchedule, sigma_buffers
 from egopose.training.loop import Evaluation, LoopSettings, Run, interrupts_held
 from egopose.training.ppo import PPO, PPOSettings
 
@@ -73,6 +75,8 @@ def build_env(
     falls_end: bool | None = None,
     dump_dir: Path | None = None,
     fragments: Sequence[FragmentLike] | None = None,
+    aids: Aids | None = None,
+    workers: int = 1,
 ) -> TransformedEnv:
     """The environment with its transforms, as ``config`` says.
 
@@ -87,6 +91,7 @@ def build_env(
         falls_end: whether a fall ends an episode; None for what the task says.
         dump_dir: where diverged worlds leave their last states.
         fragments: in place of those of ``split``.
+        aids: only for environments that a run collects in, ``workers`` of them.
 
     Raises:
         InputError: the configuration asks for a table the material lacks, lets a forecast see the future, or the rooms
@@ -118,6 +123,8 @@ def build_env(
             seed=seed,
             whole_fragments=whole_fragments,
             dump_dir=dump_dir,
+            aids=aids,
+            workers=workers,
         )
     except (ValueError, TypeError) as error:
         raise error if isinstance(error, InputError) else InputError("configuration", "task", str(error)) from None
@@ -230,6 +237,7 @@ def build_run(config: Mapping[str, Any], folder: Path, material: Material) -> Ru
     actor, critic = build_networks(config, material, probe)
     action_size = int(probe.action_spec.shape[-1])
     probe.close()
+    sigma = _sigma_schedule(config, actor)
     with interrupts_held():
         collector = build_collector(
             collector_settings,
@@ -242,7 +250,17 @@ def build_run(config: Mapping[str, Any], folder: Path, material: Material) -> Ru
     else:
         ppo = PPO(actor, critic, ppo_settings)
     settle_heap()
-    return Run(ppo, collector, settings, collector_settings, folder, config, action_size)
+    return Run(ppo, collector, settings, collector_settings, folder, config, action_size, sigma)
+
+
+def _sigma_schedule(config: Mapping[str, Any], actor: TensorDictModuleBase) -> SigmaSchedule | None:
+    """As ``aids.sigma`` says, None for a sigma that stays."""
+    settings = Aids.from_config(config.get("aids")).sigma
+    if settings is None:
+        return None
+    if config["model"]["learn_sigma"]:
+        raise InputError("configuration", "aids.sigma", "is for a fixed sigma, and model.learn_sigma is true")
+    return SigmaSchedule(sigma_buffers(actor), settings.sigma, float(config["model"]["sigma"]), settings.steps)
 
 
 def _adversarial(
@@ -273,6 +291,8 @@ def _training_env(
         threads=settings.physics_threads,
         seed=int(config["seed"]) * 1000 + worker,
         dump_dir=folder / "diverged",
+        aids=Aids.from_config(config.get("aids")),
+        workers=1 if settings.kind == "sync" else settings.workers,
     )
 
 

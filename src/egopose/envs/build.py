@@ -9,11 +9,12 @@ from typing import TYPE_CHECKING, Any
 from tensordict import TensorDictBase
 from torch import Tensor
 
+from egopose.envs.aids import Aids
 from egopose.envs.env import EgoPoseEnv
 from egopose.envs.futures import Futures
 from egopose.envs.mdp.rewards import build_reward
 from egopose.envs.problem import ActionSettings, ImitationProblem, TakeTable, TerminationSettings
-from egopose.envs.starts import FragmentLike, Starts, UniformStarts, WholeFragments, after_context
+from egopose.envs.starts import AdaptiveStarts, FragmentLike, Starts, UniformStarts, WholeFragments, after_context
 
 if TYPE_CHECKING:
     from egopose.humanoid.model import HumanoidModel
@@ -56,6 +57,8 @@ def build_env(
     seed: int = 0,
     whole_fragments: bool = False,
     dump_dir: str | Path | None = None,
+    aids: Aids | None = None,
+    workers: int = 1,
 ) -> EgoPoseEnv:
     """The batched environment.
 
@@ -68,6 +71,8 @@ def build_env(
         seed: of the starts.
         whole_fragments: evaluation: each world runs its own fragment from end to end.
         dump_dir: where diverged worlds leave their last states.
+        aids: of training; None for none, as everywhere else.
+        workers: environments like this one that a run collects in, for the time that aids are counted in.
     """
     offsets, lengths = problem.takes.offsets, problem.takes.lengths
     starts: Starts
@@ -75,6 +80,10 @@ def build_env(
         fragments = after_context(fragments, task["context"], 2 if whole_fragments else task["minimum"])
     if whole_fragments:
         starts = WholeFragments(fragments, offsets, lengths)
+    elif aids is not None and aids.starts is not None:
+        starts = AdaptiveStarts(fragments, offsets, lengths, task["horizon"], task["minimum"], aids.starts)
     else:
         starts = UniformStarts(fragments, offsets, lengths, task["horizon"], task["minimum"])
-    return EgoPoseEnv(problem, n_worlds, starts, threads=threads, seed=seed, dump_dir=dump_dir)
+    return EgoPoseEnv(
+        problem, n_worlds, starts, threads=threads, seed=seed, dump_dir=dump_dir, aids=aids, workers=workers
+    )

@@ -13,9 +13,11 @@ from torch import Tensor
 from torchrl.data import Binary, Composite, Unbounded
 from torchrl.envs import EnvBase
 
+from egopose.envs.aids import Aids, ramp
+from egopose.envs.assist import RootAssistance
 from egopose.envs.mdp.observations import BodyState, BodyView
 from egopose.envs.problem import ImitationProblem
-from egopose.envs.starts import Starts
+from egopose.envs.starts import AdaptiveStarts, Starts
 from egopose.humanoid.physics import ALL, Array, BatchedPhysics
 
 _STEPS_REWARDED_AT_ONCE = 8  # of all worlds: measured, at 64 worlds; twice or half as many are as quick
@@ -63,6 +65,8 @@ class EgoPoseEnv(EnvBase):
         threads: of the physics.
         seed: of the starts.
         dump_dir: where diverged worlds leave their last states.
+        aids: of training, see :mod:`egopose.envs.aids`; None for none.
+        workers: environments like this one that a run collects in: the aids' time goes by in all of them.
 
     A collector need not know a reward to act on: after :meth:`defer_rewards` it asks for those of a batch at once.
 
@@ -79,6 +83,8 @@ class EgoPoseEnv(EnvBase):
         threads: int = 1,
         seed: int = 0,
         dump_dir: str | Path | None = None,
+        aids: Aids | None = None,
+        workers: int = 1,
     ) -> None:
         super().__init__(device=None, batch_size=torch.Size([n_worlds]))
         humanoid = problem.humanoid
@@ -91,6 +97,10 @@ class EgoPoseEnv(EnvBase):
             body_ids=humanoid.body_ids,
             dump_dir=dump_dir,
         )
+        self._falls = None if aids is None else aids.falls
+        assist = None if aids is None else aids.assist
+        self._assistance = None if assist is None else RootAssistance(assist, problem.reference)
+        self._workers = workers
         self._generator = torch.Generator().manual_seed(seed)
         counter = torch.zeros(n_worlds, dtype=torch.int64)
         self._take, self._start, self._stop, self._frame = (counter.clone() for _ in range(4))
@@ -255,13 +265,13 @@ class EgoPoseEnv(EnvBase):
         return {"frame": frame, "episode_start": start, "episode_stop": stop, "episode_step": frame - start}
 
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
-        stopped = self.physics.step(self._target(tensordict["action"], ALL))
+        stopped = self.physics.step(self._target(tensordict["action"], ALL), self._wrench(ALL))
         return TensorDict(self._arrived(stopped, ALL), batch_size=self.batch_size)
 
     def begin_step(self, action: Tensor, worlds: slice) -> None:
         """Have the physics' threads take a step of ``worlds``, a range, under ``action [n, A]``, while the caller works
         for others."""
-        self.physics.begin_step(self._target(action, worlds), worlds)
+        self.physics.begin_step(self._target(action, worlds), worlds, self._wrench(worlds))
 
     def end_step(self, worlds: slice) -> dict[str, Any]:
         """Wait for what :meth:`begin_step` began; the entries that a step of these worlds alone would have returned.
@@ -278,16 +288,34 @@ class EgoPoseEnv(EnvBase):
         self._frame[worlds] = frame
         return self.problem.target(action.detach(), frame, self.placed[worlds]).numpy()
 
+    def _wrench(self, worlds: slice) -> Array | None:
+        """On the roots of ``worlds``, towards the frames that :meth:`_target` has set; None without assistance."""
+        if self._assistance is None:
+            return None
+        now = {k: torch.from_numpy(v[worlds]) for k, v in (("qpos", self.physics.qpos), ("qvel", self.physics.qvel))}
+        return self._assistance.wrench(now, self._frame[worlds], self._taken(worlds)).numpy()
+
+    def _taken(self, worlds: slice) -> Tensor:
+        """``[n]`` control steps that all worlds of the run have taken, when all have as many as each of these."""
+        return torch.from_numpy(self.physics.taken[worlds]) * self.batch_size[0] * self._workers
+
+    def _head_drop(self, worlds: slice) -> Tensor | None:
+        if self._falls is None:
+            return None
+        return ramp(self._falls.head_drop, self.problem.termination.head_drop, self._falls.steps, self._taken(worlds))
+
     def _arrived(self, stopped: NDArray[np.bool_], worlds: slice) -> dict[str, Any]:
         diverged = torch.from_numpy(stopped)
         body = {k: torch.from_numpy(v) for k, v in self.physics.body_state(worlds).items()}
         state = self.problem.view(body)
-        fallen = self.problem.fallen(state, self._take[worlds])
+        fallen = self.problem.fallen(state, self._take[worlds], self._head_drop(worlds))
         terminated = diverged | fallen if self.problem.termination.enabled else diverged
         frame = self._frame[worlds]
         truncated = (frame >= self._stop[worlds] - 1) & ~terminated
         clock = self._clock(worlds)
         steps = clock["episode_step"].squeeze(-1)
+        if isinstance(self.starts, AdaptiveStarts) and bool((ended := terminated | truncated).any()):
+            self.starts.ended(self._start[worlds][ended], steps[ended], terminated[ended])
         if self._unrewarded is None:
             earned = self._earned(state, frame, steps, diverged)
             reward, terms = earned[:, :1], self._terms(earned[:, 1:])
@@ -319,6 +347,7 @@ class EgoPoseEnv(EnvBase):
             "stop": self._stop.clone(),
             "frame": self._frame.clone(),
             **({"placed": self.placed.clone()} if self.problem.action.reference == "start" else {}),
+            **({"survived": self.starts.survived.clone()} if isinstance(self.starts, AdaptiveStarts) else {}),
         }
 
     def load_state_dict(self, state_dict: dict[str, Tensor], *args: Any, **kwargs: Any) -> None:
@@ -334,6 +363,8 @@ class EgoPoseEnv(EnvBase):
         )
         if self.problem.action.reference == "start":
             self.placed = state_dict["placed"].clone()
+        if isinstance(self.starts, AdaptiveStarts):
+            self.starts.survived = state_dict["survived"].clone()
 
     def close(self, *, raise_if_closed: bool = True) -> None:
         self.physics.close()

@@ -212,8 +212,11 @@ class ImitationProblem:
         reference = SimpleNamespace(**{name: table.index_select(0, frame) for name, table in self._rewarded.items()})
         return self.reward(self.view(state), reference, step)
 
-    def fallen(self, state: BodyState | BodyView, take: Tensor) -> Tensor:
-        """``[N]``: the head is too low for ``take [N]``, whether or not that ends the episode."""
+    def fallen(self, state: BodyState | BodyView, take: Tensor, head_drop: Tensor | None = None) -> Tensor:
+        """``[N]``: the head is too low for ``take [N]``, whether or not that ends the episode.
+
+        ``head_drop [N]`` m stands in for the task's while training has one of its own.
+        """
         lowest = self.takes.lowest_head_height.index_select(0, take)
         head = self.view(state).xpos[:, self.humanoid.head, 2]
-        return terminations.fallen(head, lowest, self.termination.head_drop)
+        return terminations.fallen(head, lowest, self.termination.head_drop if head_drop is None else head_drop)

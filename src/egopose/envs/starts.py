@@ -9,6 +9,8 @@ from typing import NamedTuple, Protocol
 import torch
 from torch import Tensor
 
+from egopose.envs.aids import AdaptiveStartSettings
+
 
 class FragmentLike(Protocol):
     """Frames ``start`` to ``stop`` (exclusive) of take number ``take``, counted within the take."""
@@ -94,6 +96,71 @@ class UniformStarts:
         fragment = torch.searchsorted(self._ends, pick, right=True)
         start = self._start[fragment] + pick - (self._ends[fragment] - self._choices[fragment])
         return Episodes(self._take[fragment], start, torch.minimum(start + self.horizon, self._stop[fragment]))
+
+
+class AdaptiveStarts(UniformStarts):
+    """Starts drawn the more often the sooner episodes begun near them fell, from bins of neighbouring frames.
+
+    A bin of ``s`` frames whose episodes survived n frames, as a running estimate, is drawn in proportion to
+    ``s / (n / unit + 1)`` (Yu, Park & Lee 2021, eq. 13, which counts samples in the place of frames survived), but for
+    a share ``floor`` of uniform starts, so that no start vanishes. Before the first episodes all is uniform.
+
+    Args:
+        fragments, offsets, lengths, horizon, minimum: see :class:`UniformStarts`.
+        settings: see :class:`AdaptiveStartSettings`.
+    """
+
+    def __init__(
+        self,
+        fragments: Sequence[FragmentLike],
+        offsets: Tensor,
+        lengths: Tensor,
+        horizon: int,
+        minimum: int,
+        settings: AdaptiveStartSettings,
+    ) -> None:
+        super().__init__(fragments, offsets, lengths, horizon, minimum)
+        self.settings = settings
+        order = self._start.argsort()
+        bins = [
+            (first, min(first + settings.bin, start + choices), fragment)
+            for fragment, start, choices in zip(
+                order.tolist(), self._start[order].tolist(), self._choices[order].tolist(), strict=True
+            )
+            for first in range(start, start + choices, settings.bin)
+        ]
+        self._first, ends, self._fragment = torch.tensor(bins).unbind(dim=-1)
+        self._size = ends - self._first
+        #: ``[B]`` frames survived from each bin, the running estimate; a whole horizon where nothing fell.
+        self.survived = torch.zeros(len(bins), dtype=torch.float64)
+
+    @property
+    def probability(self) -> Tensor:
+        """``[B]`` of each bin, summing to one."""
+        uniform = self._size / self._size.sum()
+        urgent = self._size / (self.survived / self.settings.unit + 1)
+        return self.settings.floor * uniform + (1 - self.settings.floor) * urgent / urgent.sum()
+
+    def __call__(self, worlds: Tensor, generator: torch.Generator) -> Episodes:
+        bounds = self.probability.cumsum(0)
+        pick = torch.rand(2, len(worlds), dtype=torch.float64, generator=generator)
+        drawn = torch.searchsorted(bounds, pick[0] * bounds[-1], right=True).clamp_max(len(bounds) - 1)
+        start = self._first[drawn] + (pick[1] * self._size[drawn]).long()
+        fragment = self._fragment[drawn]
+        return Episodes(self._take[fragment], start, torch.minimum(start + self.horizon, self._stop[fragment]))
+
+    def ended(self, start: Tensor, frames: Tensor, fell: Tensor) -> None:
+        """Take note of episodes that ended.
+
+        Args:
+            start: ``[n]`` global frames they began at.
+            frames: ``[n]`` they lasted.
+            fell: ``[n]`` whether a fall ended them; what did not fall counts as a whole horizon.
+        """
+        number = torch.searchsorted(self._first, start, right=True) - 1
+        lasted = torch.where(fell, frames, self.horizon).double()
+        for at, value in zip(number.tolist(), lasted.tolist(), strict=True):
+            self.survived[at] += self.settings.rate * (value - self.survived[at])
 
 
 class WholeFragments:

@@ -41,6 +41,7 @@ class _Worker:
         first, last = int(body_ids[0]), int(body_ids[-1])
         in_order = np.array_equal(body_ids, np.arange(first, last + 1))
         self._bodies = slice(first, last + 1) if in_order else body_ids
+        self._wrench = data.xfrc_applied[first]
         self._poses = _Poses(data.xpos, data.xquat, data.xipos)
         self._warnings = data.warning.number
 
@@ -48,16 +49,19 @@ class _Worker:
         self,
         before: Array,
         ctrl: Array,
+        wrench: Array,
         worlds: Iterator[int],
         after: Array,
         poses: _Poses,
         warned: NDArray[np.bool_],
     ) -> None:
-        """Take ``worlds`` from ``before`` to ``after`` ``[N, nstate]`` under ``ctrl [N, nu]``, until none is left."""
+        """Take ``worlds`` from ``before`` to ``after`` ``[N, nstate]`` under ``ctrl [N, nu]`` and ``wrench [N, 6]``,
+        until none is left."""
         model, data = self._model, self.data
         for i in worlds:
             mujoco.mj_setState(model, data, before[i], _FULL)
-            self._ctrl[:], self._warm_start[:] = ctrl[i], 0.0
+            # What is applied is no part of the physics' state, and the data is that of whichever world came before.
+            self._ctrl[:], self._wrench[:], self._warm_start[:] = ctrl[i], wrench[i], 0.0
             mujoco.mj_step(model, data, self._substeps)
             mujoco.mj_getState(model, data, after[i], _FULL)
             warned[i] = self._warnings.any()
@@ -154,6 +158,7 @@ class BatchedPhysics:
         self._past_ctrl = np.zeros((history, n_worlds, model.nu))
 
         self._ctrl = np.zeros((n_worlds, model.nu))
+        self._wrench = np.zeros((n_worlds, 6))
         self._after = np.empty((n_worlds, size))
         self._warned = np.zeros(n_worlds, dtype=bool)
         self._poses = _Poses(
@@ -167,6 +172,11 @@ class BatchedPhysics:
     def n_steps(self) -> int:
         """Control steps that every world has taken."""
         return int(self._taken.min())
+
+    @property
+    def taken(self) -> NDArray[np.int64]:
+        """``[N]`` control steps each world has taken; the same in all but between the two halves of a step."""
+        return self._taken.copy()
 
     @property
     def qpos(self) -> Array:
@@ -185,11 +195,13 @@ class BatchedPhysics:
         self.state[worlds, self._qvel] = qvel
         self._stale[worlds] = True
 
-    def step(self, ctrl: Array) -> NDArray[np.bool_]:
+    def step(self, ctrl: Array, wrench: Array | None = None) -> NDArray[np.bool_]:
         """One control step of all worlds.
 
         Args:
             ctrl: ``[N, nu]``, held over the substeps.
+            wrench: ``[N, 6]`` force (N) and torque (N m) in the world on the first of ``body_ids``, at its centre of
+                mass, held likewise; None for none.
 
         Returns:
             ``[N]`` worlds that diverged in it.
@@ -197,20 +209,21 @@ class BatchedPhysics:
         Raises:
             ValueError: another shape.
         """
-        self._run(self._begin(ctrl, ALL, self.threads - 1))
+        self._run(self._begin(ctrl, ALL, self.threads - 1, wrench))
         return self.end_step()
 
-    def begin_step(self, ctrl: Array, worlds: slice = ALL) -> None:
+    def begin_step(self, ctrl: Array, worlds: slice = ALL, wrench: Array | None = None) -> None:
         """Have the threads take a control step of ``worlds``, a range of them; :meth:`end_step` waits for it.
 
         Args:
             ctrl: ``[n, nu]`` of these worlds, held over the substeps.
             worlds: none of which is under way.
+            wrench: ``[n, 6]`` on their roots, see :meth:`step`.
 
         Raises:
             ValueError: another shape.
         """
-        self._begin(ctrl, worlds, self.threads)
+        self._begin(ctrl, worlds, self.threads, wrench)
 
     def end_step(self, worlds: slice = ALL) -> NDArray[np.bool_]:
         """Wait for what :meth:`begin_step` began; ``[n]`` which of these worlds diverged in it."""
@@ -230,13 +243,13 @@ class BatchedPhysics:
         self._taken[worlds] += 1
         return ~sound
 
-    def _begin(self, ctrl: Array, worlds: slice, threads: int) -> Iterator[int]:
+    def _begin(self, ctrl: Array, worlds: slice, threads: int, wrench: Array | None) -> Iterator[int]:
         first, last, _ = worlds.indices(self.n_worlds)
         if ctrl.shape != (last - first, self.model.nu):
             raise ValueError(f"ctrl must be [{last - first}, {self.model.nu}], got {list(ctrl.shape)}")
         slot = self._taken[first] % len(self._past_states)
         self._past_states[slot, worlds], self._past_ctrl[slot, worlds] = self.state[worlds], ctrl
-        self._ctrl[worlds] = ctrl
+        self._ctrl[worlds], self._wrench[worlds] = ctrl, 0.0 if wrench is None else wrench
         # One iterator for all threads: whoever is free takes the next world, so none waits longer than for one.
         numbers = iter(range(first, last))
         self._begun[first] = [self._pool.submit(self._run, numbers) for _ in range(threads)]
@@ -245,7 +258,7 @@ class BatchedPhysics:
     def _run(self, worlds: Iterator[int]) -> None:
         worker = self._idle.get()
         try:
-            worker.step(self.state, self._ctrl, worlds, self._after, self._poses, self._warned)
+            worker.step(self.state, self._ctrl, self._wrench, worlds, self._after, self._poses, self._warned)
         finally:
             self._idle.put(worker)
 

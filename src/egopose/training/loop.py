@@ -22,6 +22,7 @@ from egopose.errors import InputError
 from egopose.training import checkpoint as checkpoints
 from egopose.training import collectors
 from egopose.training.collectors import CollectorSettings
+from egopose.training.exploration import SigmaSchedule
 from egopose.training.logging import ProgressLine, Scalars
 from egopose.training.ppo import PPO, TrainingDiverged
 
@@ -120,6 +121,7 @@ class Run:
         folder: the run directory.
         config: resolved, as plain containers; ``config["task"]["name"]`` names the task.
         action_size: of the environment.
+        sigma: of the exploration as the run goes on; None where it stays.
     """
 
     ppo: PPO
@@ -129,6 +131,7 @@ class Run:
     folder: Path
     config: Mapping[str, Any]
     action_size: int
+    sigma: SigmaSchedule | None = None
     counters: Counters = field(default_factory=Counters)
     _saved: tuple[int, Path] | None = None
 
@@ -319,6 +322,8 @@ def iterate(run: Run, batches: Iterator[TensorDictBase]) -> dict[str, float]:
     threads, counters = run.collector_settings, run.counters
     clock = [time.monotonic()]
     collectors.set_threads(threads.threads)
+    if run.sigma is not None:
+        run.sigma.set(counters.frames)
     # Watched one by one: TorchRL takes an error in the first for a late answer and goes on.
     with worker_watch(run.collector):
         run.collector.update_policy_weights_()
