@@ -17,6 +17,7 @@ VERBS = {
     "estimate": "motion from a video alone: BVH and MP4",
     "export": "motions for other programs: BVH, GLB, AMASS npz, TRC, C3D, OpenSim, CSV",
     "view": "look at motions, estimates and forecasts in the browser",
+    "ship": "a trained run as a small folder to be given away: no optimisers, no paths of this machine",
     "report": "one HTML page of an evaluation or a sweep: tables, curves, pictures",
     "stream": "motion live from a camera, a video or an address: WebSocket, file, latencies",
     "bench": "measure the environment's and the pipeline's speed",

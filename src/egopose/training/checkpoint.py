@@ -27,6 +27,7 @@ from torchrl.checkpoint import Checkpoint, CheckpointError, CheckpointRotation
 
 from egopose import untrusted
 from egopose.errors import InputError
+from egopose.weights import is_shipped, shipped_run
 
 SCHEMA = 1
 CHECKSUMS = "checksums.json"
@@ -123,7 +124,7 @@ class RunCheckpoint(Checkpoint):
         stage = destination.parent / f".{destination.name}.part-{uuid.uuid4().hex}"
         try:
             super().save(stage, **options)
-            (stage / CHECKSUMS).write_text(json.dumps(_checksums(stage), indent=1, sort_keys=True))
+            seal(stage)
             for file in [*_files(stage), *(p for p in stage.rglob("*") if p.is_dir()), stage]:
                 _flush(file)
             self._publish_path(stage, destination)
@@ -188,6 +189,26 @@ def verify(path: str | Path) -> dict[str, Any]:
         raise InputError(folder, "manifest.json", f"cannot be read ({error!r})") from None
     if not isinstance(schema, int) or schema > SCHEMA:
         raise InputError(folder, "schema", f"is {schema}, this version reads up to {SCHEMA}: install a newer egopose")
+    check_files(folder)
+    untrusted.check_checkpoint_states(folder)
+    try:
+        Checkpoint.manifest(folder)
+    except CheckpointError as error:
+        raise InputError(folder, "manifest.json", str(error)) from None
+    return metadata
+
+
+def seal(folder: Path) -> None:
+    """Write the checksums of all files of ``folder``, for :func:`check_files`."""
+    (folder / CHECKSUMS).write_text(json.dumps(_checksums(folder), indent=1, sort_keys=True))
+
+
+def check_files(folder: Path) -> None:
+    """Compare every file of ``folder`` with the checksums written beside it.
+
+    Raises:
+        InputError: a file is missing, added or altered.
+    """
     expected = untrusted.read_json(folder / CHECKSUMS, CHECKSUMS)
     if not isinstance(expected, dict):
         raise InputError(folder, CHECKSUMS, "cannot be read: is no object")
@@ -199,12 +220,12 @@ def verify(path: str | Path) -> dict[str, Any]:
             raise InputError(folder, name, "does not belong to the checkpoint")
         if expected[name] != found[name]:
             raise InputError(folder, name, "does not match its checksum: the checkpoint is damaged")
-    untrusted.check_checkpoint_states(folder)
-    try:
-        Checkpoint.manifest(folder)
-    except CheckpointError as error:
-        raise InputError(folder, "manifest.json", str(error)) from None
-    return metadata
+
+
+def has_component(path: str | Path, name: str) -> bool:
+    """Whether a checkpoint folder holds that component. Raises InputError: see :func:`verify`."""
+    verify(path)
+    return name in Checkpoint.manifest(path)["components"]
 
 
 def require(metadata: Mapping[str, Any], path: str | Path, **expected: Any) -> None:
@@ -241,11 +262,14 @@ def rotation(run_dir: str | Path, keep_last: int) -> CheckpointRotation:
 def find_checkpoint(path: str | Path, which: str = "latest") -> Path:
     """A whole checkpoint folder from a run directory (its ``latest`` or ``best``), or the folder ``path`` itself.
 
-    In a run directory a damaged one is passed over, with a line on standard error, for the one before it.
+    In a run directory a damaged one is passed over, with a line on standard error, for the one before it. Of weights
+    that come with the package, ``weights:NAME``, there is one.
 
     Raises:
         InputError: there is no such run directory, or it holds no checkpoint yet, or none that is whole.
     """
+    if is_shipped(path):
+        return find_checkpoint(shipped_run(str(path)))
     folder = Path(path)
     if (folder / "manifest.json").is_file():
         return folder
