@@ -1,8 +1,8 @@
 """``python -m egopose.demo [budget=short] [key=value ...]``: from the embedded clips to a trained, evaluated policy.
 
 Prepares the default data (renders the wearer's video), trains the state regressor and a policy, evaluates them beside
-PoseReg on held-out frames and writes tables, motions and side-by-side videos. Further words are overrides of
-``conf/train.yaml``.
+PoseReg on held-out frames and writes tables, motions and side-by-side videos. Then the weights that ship with the
+package see the same held-out frames. Further words are overrides of ``conf/train.yaml``.
 """
 
 from __future__ import annotations
@@ -14,8 +14,10 @@ prepare_runtime()
 import json  # noqa: E402
 import sys  # noqa: E402
 import time  # noqa: E402
+from collections.abc import Mapping  # noqa: E402
 from datetime import datetime  # noqa: E402
 from pathlib import Path  # noqa: E402
+from typing import Any  # noqa: E402
 
 from egopose.config import compose_config  # noqa: E402
 from egopose.errors import InputError  # noqa: E402
@@ -71,15 +73,70 @@ def run_demo(budget: str, overrides: list[str]) -> Path:
     )
     policy = figures["policy"]["frames"]
     ratios = {name: policy / found["frames"] for name, found in figures.items() if name != "policy"}
-    minutes = (time.monotonic() - began) / 60
-    report = {"budget": budget, "minutes": minutes, "survival_train": figures, "policy_over": ratios}
-    (folder / "demo.json").write_text(json.dumps(report, indent=1))
     print("\nframes survived from random starts on the training takes (at most 199):")
     for name, found in figures.items():
         beaten = "" if name == "policy" else f"   policy survives {ratios[name]:.2f} times as long"
         print(f"  {name.replace('_', ' '):<20}{found['frames']:>7.1f}{beaten}")
+
+    shipped = show_shipped(agent.config, folder / "evaluation")
+    minutes = (time.monotonic() - began) / 60
+    report = {"budget": budget, "minutes": minutes, "survival_train": figures, "policy_over": ratios}
+    (folder / "demo.json").write_text(json.dumps({**report, "shipped": shipped}, indent=1))
     print(f"\n{minutes:.1f} minutes; run, checkpoints, tables and videos: {folder}", flush=True)
     return folder
+
+
+def show_shipped(config: Mapping[str, Any], out: Path) -> dict[str, str]:
+    """Estimates and forecasts, by the weights that ship with the package, of the test fragments of ``config``'s data.
+
+    Nobody seen in it was seen in their training: they learned from other people of the same collection. Prints the
+    figures; writes what an evaluation writes.
+
+    Args:
+        config: of the run on the data, resolved.
+        out: for a folder of each.
+
+    Returns:
+        The folder of each, by name; those that do not fit the data are left out, with a line.
+    """
+    from egopose.data.preparation import flow_name, store_folder
+    from egopose.evaluate import run_evaluation, summary
+    from egopose.forecast_evaluation import run_forecast_evaluation
+    from egopose.pipeline import load_agent, take_videos
+    from egopose.training.checkpoint import find_checkpoint, read_json
+    from egopose.weights import PREFIX, shipped_names
+
+    written = {}
+    for name in shipped_names():
+        own = read_json(find_checkpoint(f"{PREFIX}{name}"), "config")
+        seen = {**own, "data": config["data"]}
+        if (store_folder(seen), flow_name(seen)) != (store_folder(config), flow_name(config)):
+            print(f"\n{PREFIX}{name}: made for another body or camera than this data's; left out", flush=True)
+            continue
+        agent = load_agent(f"{PREFIX}{name}", overrides={"data": config["data"]})
+        names, videos = take_videos(agent.config)
+        forecasts = own["task"]["name"] == "forecasting"
+        settings = compose_config("evaluate", [f"checkpoint={PREFIX}{name}", *_looks(config, forecasts)])
+        print(f"\n{PREFIX}{name} on the same held-out frames, of people it has not seen (docs/model-card.md):")
+        try:
+            if forecasts:
+                print(run_forecast_evaluation(settings, [agent], names, videos, out / name), flush=True)
+            else:
+                print(summary(run_evaluation(settings, [agent], names, videos, out / name)), flush=True)
+        except InputError as error:  # other data than the demo's own may be too short to forecast
+            print(f"left out: {error}", flush=True)
+            continue
+        written[name] = str(out / name)
+    return written
+
+
+def _looks(config: Mapping[str, Any], forecasts: bool) -> list[str]:
+    """Overrides of ``conf/evaluate.yaml`` by ``demo.shipped`` of the run."""
+    chosen = config["demo"]["shipped"]
+    return [
+        f"video.takes={chosen['videos']}",
+        *([f"forecast.{key}={chosen[key]}" for key in ("horizon", "samples")] if forecasts else []),
+    ]
 
 
 def main() -> None:

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any  # noqa: E402
 
 from omegaconf import DictConfig  # noqa: E402
 
+from egopose import weights  # noqa: E402
 from egopose.config import command, from_mapping, resolved  # noqa: E402
 from egopose.errors import InputError  # noqa: E402
 
@@ -143,13 +144,15 @@ def summary(results: Results) -> str:
 
 
 def output_folder(out: str | None, checkpoint: Path, split: str) -> Path:
-    """Where results go: ``out``, or ``RUN/evaluation/SPLIT``.
+    """Where results go: ``out``, or ``RUN/evaluation/SPLIT``, or ``evaluation/NAME/SPLIT`` here for ``weights:NAME``.
 
     Raises:
         InputError: ``out`` lies inside the checkpoint, whose files are sealed by checksums.
     """
     run = checkpoint.parent.parent if checkpoint.parent.name == "checkpoints" else checkpoint.parent
-    folder = run / "evaluation" / split if out is None else Path(out)
+    # The package is no place for results.
+    beside = Path("evaluation") / run.name if run.resolve().parent == weights.FOLDER else run / "evaluation"
+    folder = beside / split if out is None else Path(out)
     if folder.resolve().is_relative_to(checkpoint.resolve()):
         raise InputError(folder, "out", "lies inside the checkpoint; choose another folder")
     return folder
@@ -166,6 +169,24 @@ def physics_group(name: str | None) -> dict[str, Any] | None:
     return None if name is None else {"sim": compose_config("prepare", [f"sim={name}"])["sim"]}
 
 
+def data_at(folder: str | None, checkpoint: str, which: str) -> dict[str, Any]:
+    """The run's own config group ``data`` with its folder there, to be an override; empty for None.
+
+    Raises:
+        InputError: None for shipped weights, which know no folder of this machine; the checkpoint cannot be read.
+    """
+    from egopose.training.checkpoint import find_checkpoint, read_json
+
+    if folder is None and not weights.is_shipped(checkpoint):
+        return {}
+    data = read_json(find_checkpoint(checkpoint, which), "config")["data"]
+    if folder is None:
+        raise InputError(
+            checkpoint, "data_folder", f"say where the set lies: data_folder=PATH ({data.get('about', '')})"
+        )
+    return {"data": {**data, "folder": str(Path(folder).expanduser().resolve())}}
+
+
 @command("evaluate")
 def main(config: DictConfig) -> None:
     """Hydra's entry."""
@@ -178,7 +199,8 @@ def main(config: DictConfig) -> None:
         paths = [str(p) for p in given] if isinstance(given, list) else [str(given)]
         overrides = physics_group(values["physics"]) or {}
         overrides |= {"corruption": values["corruption"]} if "corruption" in values else {}
-        agents = [load_agent(path, which=str(values["which"]), overrides=overrides) for path in paths]
+        which, data = str(values["which"]), values["data_folder"]
+        agents = [load_agent(path, which=which, overrides=overrides | data_at(data, path, which)) for path in paths]
         names, videos = take_videos(agents[0].config)
         spoilt = Corruption.from_config(values) is not None
         part = f"{values['split']}-corrupted" if spoilt else str(values["split"])

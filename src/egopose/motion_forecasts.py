@@ -26,9 +26,9 @@ from egopose.errors import InputError
 from egopose.evaluation.forecasting import ForecastWindow
 from egopose.inference.forecaster import placed_states
 from egopose.material import Material
-from egopose.models.motion_forecast import MotionForecaster
+from egopose.models.motion_forecast import MotionForecaster, spline_basis
 from egopose.training.baselines import FitSettings, fit
-from egopose.training.checkpoint import ComponentState, RunCheckpoint, metadata_of
+from egopose.training.checkpoint import ComponentState, RunCheckpoint, has_component, metadata_of
 from egopose.training.fragments import Span, cross_fit_blocks, group_blocks
 from egopose.training.motion_forecast import ForecasterSettings, ForecastLearner, build_forecaster, cross_fit_starts
 
@@ -56,7 +56,12 @@ def with_futures(config: Mapping[str, Any], material: Material, run: Path) -> Ma
     if not folder.is_dir():
         _train(config, material, folder)
     saved: dict[str, Tensor] = {}
-    RunCheckpoint({"futures": ComponentState(dict, saved.update)}).restore(folder, {"futures"})
+    if has_component(folder, "futures"):
+        RunCheckpoint({"futures": ComponentState(dict, saved.update)}).restore(folder, {"futures"})
+    else:  # shipped without those of its training frames: others are put in where a forecast begins
+        assert material.states is not None
+        knots, size = spline_basis(settings.horizon + 1, settings.spacing, _fps(material))[0].shape[1], _size(material)
+        saved = {"coefficients": torch.zeros(0, knots, size), "starts": torch.zeros(0, dtype=torch.int64)}
     return replace(material, futures=_futures(material, settings, saved["coefficients"], saved["starts"]))
 
 
@@ -85,6 +90,12 @@ def _settings(config: Mapping[str, Any]) -> tuple[ForecasterSettings, FitSetting
     return ForecasterSettings.from_config(values), FitSettings.from_config(config["forecaster"]["optimiser"])
 
 
+def _size(material: Material) -> int:
+    """P: numbers of a humanoid state that are its pose and not its joints' velocities."""
+    assert material.states is not None
+    return 11 + (material.states.shape[1] - 11) // 2
+
+
 def _fps(material: Material) -> float:
     return 1.0 / material.humanoid.control_dt
 
@@ -111,7 +122,7 @@ def _train(config: Mapping[str, Any], material: Material, folder: Path) -> None:
     pieces = split_takes(store.takes, config["data"]["split"], "train", supported_only=False)
     spans = [Span(*span) for span in global_spans(store, pieces)]
     truth, seen = humanoid_state(material.reference).float(), material.states
-    size = 11 + (truth.shape[1] - 11) // 2
+    size = _size(material)
     truth, seen = truth[:, :size], seen[:, :size]
     hands, seed, fps = [int(d) for d in material.humanoid.hand_dofs], int(config["seed"]), _fps(material)
 

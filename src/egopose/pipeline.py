@@ -368,9 +368,10 @@ def load_agent(
     """
     folder = find_checkpoint(path, which)
     metadata = verify(folder)
-    config = {**read_json(folder, "config"), **(overrides or {})}
+    own = read_json(folder, "config")
+    config = {**own, **(overrides or {})}
     if material is None:
-        same_store = _STORE_GROUPS.isdisjoint(overrides or {})
+        same_store = not _other_store(own, config)
         material = run_material(config, folder.resolve().parent.parent, same_store)
     material = with_futures(config, material, folder.resolve().parent.parent)
     env = build_env(config, material, worlds=1)
@@ -389,6 +390,16 @@ def load_agent(
         return made
 
     return Agent(actor.eval(), critic.eval(), config, material, make_env, folder)
+
+
+def _other_store(own: Mapping[str, Any], config: Mapping[str, Any]) -> bool:
+    """Whether ``config`` asks for other data than a run's own, and not for the same that lies elsewhere by now."""
+
+    def parts(one: Mapping[str, Any]) -> list[Any]:
+        place = dict.fromkeys(("folder", "store"))
+        return [{**one[group], **place} if group == "data" else one[group] for group in sorted(_STORE_GROUPS)]
+
+    return bool(parts(own) != parts(config))
 
 
 def take_videos(config: Mapping[str, Any]) -> tuple[list[str], list[TakeVideo | None]]:
