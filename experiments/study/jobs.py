@@ -20,6 +20,7 @@ from egopose.data.store import TakeStore
 from egopose.evaluation.agents import evaluate_agent
 from egopose.evaluation.forecasting import ForecastWindow, forecast_windows, score_forecasts, true_futures
 from egopose.evaluation.protocols import METRICS, ContactSettings, TakeScores, score_take
+from egopose.evaluation.survival import base_tracking, frames_survived, reference_tracking
 from egopose.evaluation.tables import write_json
 from egopose.forecast_contexts import past_states
 from egopose.forecast_evaluation import ForecastSettings, forecast_windows_of, windows_of
@@ -30,7 +31,7 @@ from egopose.models.baselines.path_pose import PathPose
 from egopose.models.baselines.recurrent import RecurrentForecaster
 from egopose.motion.rotations import Array
 from egopose.motion_forecasts import begin_forecasts
-from egopose.pipeline import load_agent
+from egopose.pipeline import Agent, load_agent
 from egopose.regression import load_regressor
 from egopose.train import run_job as train_job
 from egopose.training.logging import write_provenance
@@ -117,7 +118,8 @@ def _estimates(
         failsafe = from_mapping(FailSafeSettings, settings["failsafe"], "conf/evaluate.yaml: failsafe")
         found = evaluate_agent(agent, fragments, labels, "test", failsafe, contact, int(settings["threads"]))
         diverged = sum(one.estimate.diverged for one in found)
-        return _figures([one.scores for one in found]) | {"diverged": int(diverged)}
+        survival = {"survival": _survival(agent, settings)} if job.survival else {}
+        return _figures([one.scores for one in found]) | {"diverged": int(diverged)} | survival
     material = _material(folder, config, judged)
     fragments = list(material.test)
     labels = _labels(judged, fragments)
@@ -137,6 +139,19 @@ def _estimates(
         reference = truth[first : first + len(motion)]
         scores.append(score_take(motion.name, motion.qpos, reference, material.humanoid, contact))
     return _figures(scores)
+
+
+def _survival(agent: Agent, settings: dict[str, Any]) -> dict[str, list[int]]:
+    """Frames to a fall of each episode on the training takes, from the same uniform starts whoever acts.
+
+    ``policy``: its mean action. The others need no training, see :mod:`egopose.evaluation.survival`.
+    """
+    env = agent.make_env("train", worlds=int(settings["survival"]["worlds"]), threads=int(settings["threads"]))
+    acting = {"policy": agent.actor, "base_tracking": base_tracking(env), "reference_tracking": reference_tracking(env)}
+    seed = int(settings["survival"]["seed"])
+    out = {name: frames_survived(env, controller, seed).frames.tolist() for name, controller in acting.items()}
+    env.close()
+    return out
 
 
 def _figures(scores: Sequence[TakeScores]) -> Result:

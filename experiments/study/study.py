@@ -1,4 +1,4 @@
-"""Runs every job of tables 1, 2 and 3 that is not done yet, one at a time; half-done ones go on where they stopped.
+"""Runs every job of tables 1 to 4 that is not done yet, one at a time; half-done ones go on where they stopped.
 
     python experiments/study/study.py data.folder=PATH/cmu_bvh60 [--hours 8] [--only 'posereg-*'] [--list]
 
@@ -47,6 +47,7 @@ class Job:
         store: name of its store, "" for the user's cache.
         evaluate: overrides of what it is judged on, the run's own where empty; ``evaluate_store`` its store.
         settings: overrides of conf/evaluate.yaml.
+        survival: whether the mean action's survival from uniform starts of the training takes is judged too.
     """
 
     table: str
@@ -62,6 +63,7 @@ class Job:
     evaluate: tuple[str, ...]
     evaluate_store: str
     settings: tuple[str, ...]
+    survival: bool = False
 
     @property
     def name(self) -> str:
@@ -70,7 +72,9 @@ class Job:
     @property
     def fingerprint(self) -> str:
         """Changes with the settings and the budget, not with where things lie on a machine."""
-        return hashlib.sha256(json.dumps(asdict(self), sort_keys=True).encode()).hexdigest()[:16]
+        # What most jobs lack is left out, so that results from before it was thought of still count.
+        about = {key: value for key, value in asdict(self).items() if key != "survival" or value}
+        return hashlib.sha256(json.dumps(about, sort_keys=True).encode()).hexdigest()[:16]
 
     def raw(self, results: Path) -> Path:
         """Where its result goes."""
@@ -88,7 +92,7 @@ def list_jobs(study: Mapping[str, Any]) -> list[Job]:
         for seed in row["seeds"]:
             for protocol in row["protocols"]:
                 for fold in _named(study, "folds", protocol):
-                    jobs += [_job(study, row["table"], m, protocol, fold, seed) for m in row["methods"]]
+                    jobs += [_job(study, row, m, protocol, fold, seed) for m in row["methods"]]
     seen: set[str] = set()
     for job in jobs:
         if job.name in seen:
@@ -97,7 +101,7 @@ def list_jobs(study: Mapping[str, Any]) -> list[Job]:
     return jobs
 
 
-def _job(study: Mapping[str, Any], table: str, method: str, protocol: str, fold: str, seed: int) -> Job:
+def _job(study: Mapping[str, Any], row: Mapping[str, Any], method: str, protocol: str, fold: str, seed: int) -> Job:
     judged, trained_in = _named(study, "folds", protocol)[fold], protocol
     trained = judged
     if "of" in judged:
@@ -106,11 +110,11 @@ def _job(study: Mapping[str, Any], table: str, method: str, protocol: str, fold:
     what = _named(study, "methods", method)
     of = what.get("of", method)
     how = _named(study, "methods", of)
-    own = [] if how["verb"] == "regressor" else [f"training.total_steps={study['budget']}"]
+    own = [] if how["verb"] == "regressor" else [f"training.total_steps={row.get('budget', study['budget'])}"]
     seeds = [word.format(seed=seed) for word in study["seed"]] if how["verb"] != "regressor" else []
     overrides = [*study["data"], *trained["overrides"], *how.get("overrides", ()), *own, *seeds]
     return Job(
-        table,
+        row["table"],
         method,
         protocol,
         fold,
@@ -123,6 +127,7 @@ def _job(study: Mapping[str, Any], table: str, method: str, protocol: str, fold:
         tuple(judged.get("evaluate", ())),
         judged.get("store", "") if "of" in judged else "",
         tuple(what.get("settings", ())),
+        bool(row.get("survival", False)),
     )
 
 

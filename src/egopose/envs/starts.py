@@ -129,7 +129,7 @@ class AdaptiveStarts(UniformStarts):
             )
             for first in range(start, start + choices, settings.bin)
         ]
-        self._first, ends, self._fragment = torch.tensor(bins).unbind(dim=-1)
+        self._first, ends, self._fragment = torch.tensor(bins).T.contiguous().unbind()
         self._size = ends - self._first
         #: ``[B]`` frames survived from each bin, the running estimate; a whole horizon where nothing fell.
         self.survived = torch.zeros(len(bins), dtype=torch.float64)
