@@ -136,6 +136,7 @@ class Workers:
                 frames_per_batch=frames * (workers if kind == "multi_sync" else 1),
                 total_frames=-1,
                 cat_results=0 if kind == "multi_sync" else None,
+                use_buffers=True,
                 num_sub_threads=threads,
                 num_threads=torch.get_num_threads(),
                 collector_class=WorkerCollector,
