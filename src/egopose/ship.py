@@ -142,7 +142,7 @@ def _about(values: Mapping[str, Any], run: Path, checkpoint: Path, config: Mappi
         key: read_json(run / f"{key}.json", key) if (run / f"{key}.json").is_file() else None
         for key in ("git", "versions", "finished")
     }
-    first = next(iter(raws.values()), {})
+    first: dict[str, Any] = next(iter(raws.values()), {})
     noted = (notes["git"] or {}).get("commit")
     return {
         "name": str(values["name"]),

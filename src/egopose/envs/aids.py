@@ -109,8 +109,8 @@ class Aids:
         }
         if unknown := set(values) - set(kinds):
             raise InputError(source, sorted(unknown)[0], f"is not an aid; there are {', '.join(kinds)}")
-        parts = {
-            name: from_mapping(kinds[name], part, f"{source}: {name}")  # type: ignore[arg-type]
+        parts: dict[str, Any] = {
+            name: from_mapping(kinds[name], part, f"{source}: {name}")
             for name, part in values.items()
             if part is not None
         }

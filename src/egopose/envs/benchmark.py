@@ -24,7 +24,8 @@ class StepRecorder:
     ctrls: list[Array] = field(default_factory=list)
 
     def __post_init__(self) -> None:
-        begin, parts = self.physics._begin, []
+        begin: Any = self.physics._begin
+        parts: list[tuple[Array, Array]] = []
 
         def recorded(ctrl: Array, worlds: slice, threads: int) -> Any:
             parts.append((self.physics.state[worlds].copy(), ctrl.copy()))
@@ -35,7 +36,7 @@ class StepRecorder:
                 parts.clear()
             return begin(ctrl, worlds, threads)
 
-        self.physics._begin = recorded  # type: ignore[method-assign]
+        self.physics._begin = recorded  # type: ignore[assignment, method-assign]
 
     def clear(self) -> None:
         """Forget what was recorded."""
