@@ -27,7 +27,8 @@ from egopose.evaluation.forecasting import ForecastWindow
 from egopose.material import Material
 from egopose.models.motion_forecast import spline_basis
 from egopose.motion import rotations as rot
-from egopose.motion_forecasts import FOLDER, begin_forecasts
+from egopose.motion_forecasts import FOLDER, begin_forecasts, with_futures
+from egopose.ship import _copy_components
 from egopose.training.baselines import FitSettings, fit
 from egopose.training.checkpoint import ComponentState, RunCheckpoint, metadata_of
 from egopose.training.fragments import Span, cross_fit_blocks, group_blocks
@@ -238,6 +239,38 @@ def test_a_forecast_follows_what_its_context_shows_and_nothing_else(material: Ma
     torch.testing.assert_close(first, wanted[:, 0])
     torch.testing.assert_close(qpos[:, 7:].float(), first[:, 5:-6])
     assert qvel.isfinite().all()
+
+
+def test_shipped_forecasters_bring_no_curves_of_training_and_forecast_the_same(
+    material: Material, tmp_path: Path
+) -> None:
+    config, known = configuration(), curves(material)
+    size, made = known.coefficients.shape[-1], settings()
+    members = nn.ModuleList(
+        [build_forecaster(made, torch.zeros(size), torch.ones(size), FPS, seed) for seed in range(made.members)]
+    )
+    table = {"coefficients": known.coefficients, "starts": known.starts}
+    RunCheckpoint({"members": members, "futures": ComponentState(lambda: table, lambda _: None)}).save(
+        tmp_path / "run" / FOLDER, metadata=metadata_of("motion forecaster", size, 0, 0, 0.0)
+    )
+    _copy_components(tmp_path / "run" / FOLDER, tmp_path / "shipped" / FOLDER, ("members",))
+    assert material.states is not None
+    windows = [ForecastWindow(0, 9, 5, 12)]
+    pasts = material.states[9:14][None].double()
+    found = []
+    for run in ("run", "shipped"):
+        followed = with_futures(config, material, tmp_path / run)
+        assert followed.futures is not None
+        assert len(followed.futures.starts) == (0 if run == "shipped" else len(known.starts))
+        path = tmp_path / run / "checkpoints" / "checkpoint-1"
+        path.mkdir(parents=True)
+        make_env, network = partial(pipeline.build_env, config, followed), nn.Identity()
+        agent = pipeline.Agent(network, network, config, followed, make_env, path)  # type: ignore[arg-type]
+        qpos, qvel = begin_forecasts(agent, windows, pasts)
+        now = torch.tensor([windows[0].now])
+        found.append((qpos, qvel, *(followed.futures.poses(now, now * 0 + step) for step in range(12))))
+        make_env(worlds=1).close()
+    assert all(torch.equal(one, other) for one, other in zip(*found, strict=True))
 
 
 def test_bad_settings_are_named() -> None:
