@@ -19,6 +19,7 @@ import numpy as np
 
 from egopose.errors import InputError
 from egopose.evaluation.statistics import Interval, mean_interval
+from egopose.motion.rotations import Array
 from egopose.untrusted import read_json
 
 HERE = Path(__file__).resolve().parent
@@ -87,7 +88,7 @@ def table(found: Mapping[tuple[int, str], Mapping[str, Any]]) -> list[str]:
     return lines
 
 
-def _difference(frames: np.ndarray[Any, np.dtype[np.float64]], plain: Mapping[str, Any]) -> Interval:
+def _difference(frames: Array, plain: Mapping[str, Any]) -> Interval:
     """Of the same episodes. Raises InputError: there are more or fewer."""
     other = np.array(plain["survival"]["policy"], dtype=np.float64)
     if other.shape != frames.shape:

@@ -101,7 +101,7 @@ class Aids:
             InputError: a setting is missing, unknown or out of range; names it.
         """
         values = values or {}
-        kinds = {
+        kinds: dict[str, Any] = {
             "starts": AdaptiveStartSettings,
             "assist": AssistSettings,
             "falls": FallSettings,
