@@ -93,7 +93,7 @@ def test_a_video_becomes_a_motion_of_its_length(run: Path, tmp_path: Path) -> No
     with (out / "frames.csv").open() as stream:
         rows = list(csv.DictReader(stream))
     assert len(rows) == FRAMES
-    assert set(rows[0]) == {"frame", "value", "confidence", "reset", "fallen"}
+    assert set(rows[0]) == {"frame", "value", "confidence", "triggered", "reset", "fallen"}
     shown = probe_video(out / "side_by_side.mp4")
     assert (shown.width, shown.height, shown.frames) == (3 * 64, 64, FRAMES)
 
