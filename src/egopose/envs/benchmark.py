@@ -36,7 +36,7 @@ class StepRecorder:
                 parts.clear()
             return begin(ctrl, worlds, threads, wrench)
 
-        self.physics._begin = recorded  # type: ignore[assignment, method-assign]
+        self.physics._begin = recorded  # type: ignore[method-assign]
 
     def clear(self) -> None:
         """Forget what was recorded."""
