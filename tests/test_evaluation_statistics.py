@@ -52,3 +52,11 @@ def test_what_cannot_be_averaged_is_refused(scores: list, message: str) -> None:
 def test_ratio_needs_the_same_takes() -> None:
     with pytest.raises(ValueError, match="pair up"):
         ratio_interval(np.ones((1, 3)), np.ones((1, 4)))
+
+
+def test_a_baseline_without_error_on_some_takes_leaves_the_ratio_open_above() -> None:
+    with np.errstate(all="raise"):
+        found = ratio_interval([[1.0, 1.0, 1.0]], [[0.0, 0.0, 1.0]])
+    assert found.high == np.inf
+    assert np.isfinite(found.low)
+    assert found.value == pytest.approx(3.0)

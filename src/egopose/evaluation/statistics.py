@@ -8,6 +8,7 @@ takes. The figure of a table is the unweighted mean over takes, then over runs.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -60,7 +61,11 @@ def ratio_interval(
     both = np.isfinite(above).all(axis=0) & np.isfinite(below).all(axis=0)
     above, below = _complete(above[:, both]), _complete(np.broadcast_to(below, above.shape)[:, both])
     runs, takes = _draws(above.shape, draws, seed)
-    ratios = _resampled_means(above, runs, takes) / _resampled_means(below, runs, takes)
+    below_means = _resampled_means(below, runs, takes)
+    # A draw of takes on which the baseline makes no error at all says that nothing bounds the ratio above.
+    ratios = np.divide(
+        _resampled_means(above, runs, takes), below_means, out=np.full(len(below_means), np.inf), where=below_means != 0
+    )
     return _interval(float(above.mean() / below.mean()), ratios, above.shape, level)
 
 
@@ -87,5 +92,7 @@ def _resampled_means(scores: Array, runs: NDArray[np.int64], takes: NDArray[np.i
 
 
 def _interval(value: float, resampled: Array, shape: tuple[int, ...], level: float) -> Interval:
-    low, high = np.quantile(resampled, [(1 - level) / 2, (1 + level) / 2])
+    # Between a number and infinity nothing can be interpolated.
+    method: Literal["linear", "nearest"] = "linear" if np.isfinite(resampled).all() else "nearest"
+    low, high = np.quantile(resampled, [(1 - level) / 2, (1 + level) / 2], method=method)
     return Interval(value, float(low), float(high), runs=shape[0], takes=shape[1])
