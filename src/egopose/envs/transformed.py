@@ -39,12 +39,13 @@ class Entries(dict[Any, Any]):
         """Keys and tensors, those of nested TensorDicts by tuples."""
         for key, value in self.items():
             if isinstance(value, TensorDictBase):
-                yield from (((key, *_path(inner)), leaf) for inner, leaf in value.items(True, True))
+                yield from (((key, *key_path(inner)), leaf) for inner, leaf in value.items(True, True))
             else:
                 yield key, value
 
 
-def _path(key: Any) -> tuple[Any, ...]:
+def key_path(key: Any) -> tuple[Any, ...]:
+    """A TensorDict's key as a tuple of its parts."""
     return key if isinstance(key, tuple) else (key,)
 
 

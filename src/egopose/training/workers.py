@@ -18,6 +18,7 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.collectors import Collector, MultiAsyncCollector, MultiSyncCollector
 from torchrl.envs import EnvBase, TransformedEnv
 
+from egopose.envs.transformed import key_path
 from egopose.errors import InputError
 from egopose.runtime import prefer_quick_products
 from egopose.training.moments import merge_states, without_counts
@@ -38,7 +39,7 @@ def base_env(env: EnvBase) -> EnvBase:
 def read_simulation(collector: Collector) -> State:
     """Where every world of a collector's own environment stands, and what the policy will see next."""
     # TorchRL keeps the observation after the last step, and nothing else tells it, in `_carrier`.
-    seen = {".".join(_path(key)): value.clone() for key, value in collector._carrier.items(True, True)}
+    seen = {".".join(key_path(key)): value.clone() for key, value in collector._carrier.items(True, True)}
     return {"carrier": seen, "worlds": dict(base_env(collector.env).state_dict())}
 
 
@@ -281,7 +282,3 @@ def _unpacked(state: Mapping[str, Any]) -> State:
         key: _unpacked(value) if isinstance(value, Mapping) else torch.from_numpy(np.array(value))
         for key, value in state.items()
     }
-
-
-def _path(key: Any) -> tuple[str, ...]:
-    return key if isinstance(key, tuple) else (key,)
