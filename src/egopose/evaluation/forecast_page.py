@@ -19,7 +19,7 @@ from egopose.evaluation import charts, page
 from egopose.evaluation.charts import Line
 from egopose.evaluation.forecast_report import FUTURE_COLOUR, TRUTH_COLOUR, other_file
 from egopose.evaluation.forecasting import METRICS
-from egopose.evaluation.html_report import ReportSettings
+from egopose.evaluation.html_report import ReportSettings, root_aligned_errors
 from egopose.evaluation.report import RENDERED_NOTE
 from egopose.humanoid.model import HumanoidModel
 from egopose.motion.io import read_motion
@@ -50,8 +50,7 @@ class WindowMotions:
 
     def joint_errors(self, method: str) -> Array:
         """``[H, J]`` mm: distance of each joint from the true one, roots moved together."""
-        positions, truth = (m.forward_kinematics()[0] for m in (self.told[method], self.truth))
-        return 1e3 * np.linalg.norm((positions - positions[:, :1]) - (truth - truth[:, :1]), axis=-1)
+        return root_aligned_errors(self.told[method], self.truth)
 
 
 def write_forecast_page(folder: Path, humanoid: HumanoidModel | None, settings: ReportSettings, out: Path) -> Path:

@@ -58,8 +58,13 @@ class TakeMotions:
 
     def joint_errors(self, motion: Motion) -> Array:
         """``[T, J]`` mm: distance of each joint from the reference's, roots moved together."""
-        positions, truth = (m.forward_kinematics()[0] for m in (motion, self.reference))
-        return 1e3 * np.linalg.norm((positions - positions[:, :1]) - (truth - truth[:, :1]), axis=-1)
+        return root_aligned_errors(motion, self.reference)
+
+
+def root_aligned_errors(told: Motion, truth: Motion) -> Array:
+    """``[T, J]`` mm: distance of each joint from the true one, roots moved together."""
+    there, true = (m.forward_kinematics()[0] for m in (told, truth))
+    return 1e3 * np.linalg.norm((there - there[:, :1]) - (true - true[:, :1]), axis=-1)
 
 
 def write_report(folder: Path, humanoid: HumanoidModel | None, settings: ReportSettings, out: Path) -> Path:
