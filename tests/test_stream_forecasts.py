@@ -21,7 +21,9 @@ from egopose import pipeline
 from egopose.benchmarks import stream as bench
 from egopose.benchmarks.stream import untrained_forecaster
 from egopose.config import compose_config
+from egopose.envs.futures import FollowFuture
 from egopose.errors import InputError
+from egopose.inference.context_states import context_states
 from egopose.inference.forecaster import forecast
 from egopose.inference.stream import messages
 from egopose.inference.stream.forecast_recording import ForecastRecording
@@ -31,6 +33,7 @@ from egopose.inference.stream.latency import LatencyTable
 from egopose.inference.stream.outputs import open_outputs
 from egopose.models.recurrent import PastContext
 from egopose.motion.io.native import skeleton_from_json
+from egopose.motion_forecasts import still_futures
 from egopose.stream import (
     Forecaster,
     Trained,
@@ -42,6 +45,7 @@ from egopose.stream import (
     stream,
 )
 from egopose.training.checkpoint import RunCheckpoint, metadata_of
+from egopose.training.motion_forecast import ForecasterSettings, build_forecaster
 from egopose.training.predictions import torch_threads
 
 CONTEXT = 30
@@ -286,6 +290,55 @@ def forecasting_run(trained: Trained, tmp_path_factory: pytest.TempPathFactory) 
     made.save()
     made.collector.shutdown()
     return folder
+
+
+@pytest.fixture(scope="module")
+def following_run(trained: Trained, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run directory of an untrained policy that follows kinematic forecasts, whose networks are untrained too."""
+    folder = tmp_path_factory.mktemp("following")
+    small = ["collector.worlds=2", "algo.steps_per_iteration=16", "algo.minibatch_size=16", "logger=csv"]
+    config = compose_config("train", ["experiment=forecasting_follow", "regressor=fast", *small])
+    size = 2 * trained.humanoid.mj_model.nq - 3
+    weights = {"regressor": trained.regressor, "config": {"state_size": size, **config}}
+    RunCheckpoint(weights).save(folder / "regressor", metadata=metadata_of("regressor", size, 1, 0, 0.0))
+    values = {key: value for key, value in config["forecaster"].items() if key != "optimiser"}
+    settings, pose = ForecasterSettings.from_config(values), 11 + trained.humanoid.mj_model.nu
+    parts = [build_forecaster(settings, torch.zeros(pose), torch.ones(pose), 30.0, k) for k in range(settings.members)]
+    kept = {"members": torch.nn.ModuleList(parts)}
+    RunCheckpoint(kept).save(folder / "forecaster", metadata=metadata_of("motion forecaster", pose, 0, 0, 0.0))
+    material = still_futures(config, still_frames(trained.humanoid, trained.regressor, trained.made_with, 70))
+    made = pipeline.build_run(config, folder, material)
+    made.save()
+    made.collector.shutdown()
+    return folder
+
+
+@pytest.mark.parametrize("samples", [1, 3])
+def test_a_run_that_follows_forecasts_live_what_it_does_offline(
+    trained: Trained, following_run: Path, samples: int
+) -> None:
+    told = [f"forecast.checkpoint={following_run}", "forecast.which=latest", "forecast.horizon=20", "forecast.seed=5"]
+    made = load_forecaster(values_of(*told, f"forecast.samples={samples}"), trained)
+    assert made is not None
+    futures = LiveFutures(made.env, made.actor, made.regressor, made.settings, 0.3, made.curves)
+    moment = moment_of(trained)
+    moment.qpos[:2] = 2.0, 3.0
+    live = futures.roll(moment)
+    other = load_forecaster(values_of(*told, f"forecast.samples={max(samples - 1, 1)}"), trained)
+    assert other is not None
+    assert other.curves is not None
+    (follow,) = (part for part in other.env.transform if isinstance(part, FollowFuture))
+    now, problem = torch.tensor([CONTEXT - 1]), other.env.base_env.problem
+    seen = context_states(other.regressor, torch.from_numpy(moment.flow), [0], CONTEXT).double()
+    follow.futures.put(other.curves(seen), now)
+    first = follow.futures.first_state(now, torch.from_numpy(moment.qpos)[None], problem.humanoid.joint_range)
+    offline = forecast(other.env, other.actor, *first, samples, 20, seed=5 + moment.frame, noise_time=0.3)
+    found = live.qpos[None] if samples == 1 else live.drawn
+    np.testing.assert_allclose(found[:, :12], offline.qpos[0, :, :12], atol=1e-4)
+    np.testing.assert_allclose(live.qpos[0, :2], [2.0, 3.0], atol=0.1)
+    # Another past, another curve.
+    again = futures.roll(replace(moment, frame=400, flow=-50 * moment.flow))
+    assert np.abs(again.qpos - live.qpos).max() > 1e-4
 
 
 def test_a_forecasting_run_is_used_by_its_path(run: Path, forecasting_run: Path, tmp_path: Path) -> None:  # noqa: F811

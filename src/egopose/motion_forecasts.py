@@ -39,7 +39,9 @@ FOLDER = "forecaster"
 
 
 def with_futures(config: Mapping[str, Any], material: Material, run: Path) -> Material:
-    """The material with the run's forecasts, trained where that has not been done; itself where it has no forecaster.
+    """The material with the run's forecasts, trained where that has not been done.
+
+    Itself where the run has no forecaster, or the material has forecasts already.
 
     Args:
         config: resolved; its group ``forecaster`` says how, or is null.
@@ -49,7 +51,7 @@ def with_futures(config: Mapping[str, Any], material: Material, run: Path) -> Ma
     Raises:
         InputError: a setting is wrong, there are no regressed states, or what is kept is damaged.
     """
-    if config.get("forecaster") is None:
+    if config.get("forecaster") is None or material.futures is not None:
         return material
     settings, _ = _settings(config)
     folder = run / FOLDER
@@ -77,12 +79,44 @@ def begin_forecasts(agent: Agent, windows: Sequence[ForecastWindow], pasts: Tens
     limits = material.humanoid.joint_range
     if material.futures is None:
         return placed_states(pasts[:, -1].numpy(), where.numpy(), limits)
-    settings, _ = _settings(agent.config)
-    size = material.futures.coefficients.shape[-1]
-    members = _members(settings, agent.path.resolve().parent.parent / FOLDER, size, _fps(material))
-    curves = _curves(members, members[0].normalise(pasts[..., :size]))
-    material.futures.put(curves, now)
+    curves = ForecastCurves(agent.config, material, agent.path.resolve().parent.parent)
+    material.futures.put(curves(pasts), now)
     return material.futures.first_state(now, where, limits)
+
+
+def still_futures(config: Mapping[str, Any], material: Material) -> Material:
+    """The material with forecasts of a body that stays as it is in the first frame."""
+    assert material.states is not None
+    settings, _ = _settings(config)
+    knots = spline_basis(settings.horizon + 1, settings.spacing, _fps(material))[0].shape[1]
+    # The splines add up to one everywhere.
+    frames = len(material.reference)
+    curves = material.states[:1, None, : _size(material)].expand(frames, knots, -1)
+    return replace(material, futures=_futures(material, settings, curves, torch.arange(frames)))
+
+
+class ForecastCurves:
+    """A run's forecaster: from states seen ``[W, context, S]`` to a curve's coefficients ``[W, K, P]``.
+
+    Args:
+        config: of the run, resolved.
+        material: of its humanoid, with the states a regressor sees.
+        run: the run directory.
+
+    Attributes:
+        context: frames it sees.
+
+    Raises:
+        InputError: what is kept in the run is damaged or not there.
+    """
+
+    def __init__(self, config: Mapping[str, Any], material: Material, run: Path) -> None:
+        settings, _ = _settings(config)
+        self.context, self._size = settings.context, _size(material)
+        self._members = _members(settings, run / FOLDER, self._size, _fps(material))
+
+    def __call__(self, pasts: Tensor) -> Tensor:
+        return _curves(self._members, self._members[0].normalise(pasts[..., : self._size]))
 
 
 def _settings(config: Mapping[str, Any]) -> tuple[ForecasterSettings, FitSettings]:

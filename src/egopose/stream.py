@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from egopose.inference.stream.sources import SourceSettings
     from egopose.material import Material
     from egopose.models.regressor import StateRegressor
+    from egopose.motion_forecasts import ForecastCurves
 
 _CONFIG = "conf/stream.yaml"
 
@@ -91,6 +92,7 @@ class Forecaster:
         actor, regressor: in eval mode.
         flow_size: S of the flow its encoder sees.
         settings: of the stream's forecasts.
+        curves: of a policy that follows kinematic forecasts.
     """
 
     env: TransformedEnv
@@ -98,6 +100,7 @@ class Forecaster:
     regressor: StateRegressor
     flow_size: int
     settings: ForecastSettings
+    curves: ForecastCurves | None = None
 
 
 def forecast_settings(values: Mapping[str, Any]) -> ForecastSettings:
@@ -121,6 +124,7 @@ def load_forecaster(values: Mapping[str, Any], trained: Trained) -> Forecaster |
     """
     from egopose.data.preparation import humanoid_of
     from egopose.estimate import run_folder
+    from egopose.motion_forecasts import ForecastCurves, still_futures
     from egopose.pipeline import load_agent
     from egopose.regression import load_regressor
     from egopose.training.checkpoint import find_checkpoint, read_json
@@ -131,8 +135,10 @@ def load_forecaster(values: Mapping[str, Any], trained: Trained) -> Forecaster |
     folder = find_checkpoint(str(checkpoint), str(values["forecast"]["which"]))
     config = read_json(folder, "config")
     task = config["task"]
-    if task.get("context") is None or config["model"]["context"]["source"] != "past":
-        cause = "a live forecast is one of `egopose train experiment=forecasting`; name such a run, or null for none"
+    follows = config.get("forecaster") is not None
+    if task.get("context") is None or not (follows or config["model"]["context"]["source"] == "past"):
+        cause = "a live forecast is one of `egopose train experiment=forecasting`, or `forecasting_follow`"
+        cause += "; name such a run, or null for none"
         raise InputError(folder, "task", f"this run's is {task['name']}: {cause}")
     humanoid = humanoid_of(config)
     if humanoid.skeleton != trained.humanoid.skeleton or humanoid.control_dt != trained.humanoid.control_dt:
@@ -141,9 +147,14 @@ def load_forecaster(values: Mapping[str, Any], trained: Trained) -> Forecaster |
     flows = ({**dict(made["vision"]["flow"]), "workers": 1} for made in (made_with, trained.made_with))
     if len({tuple(sorted(flow.items())) for flow in flows}) > 1:
         raise InputError(folder, "vision.flow", "another flow than the estimating run's: train both with one vision")
-    agent = load_agent(folder, still_frames(humanoid, regressor, made_with, task["context"] + task["minimum"]))
+    material = still_frames(humanoid, regressor, made_with, task["context"] + task["minimum"])
+    curves = None
+    if follows:
+        material = still_futures(config, material)
+        curves = ForecastCurves(config, material, run_folder(folder))
+    agent = load_agent(folder, material)
     env = agent.make_env("test", worlds=1 + settings.drawn, threads=1, whole_fragments=True, falls_end=False)
-    return Forecaster(env, agent.actor, regressor, int(made_with["vision"]["flow"]["stored_size"]), settings)
+    return Forecaster(env, agent.actor, regressor, int(made_with["vision"]["flow"]["stored_size"]), settings, curves)
 
 
 def still_frames(
@@ -221,7 +232,8 @@ def _forecasts(values: Mapping[str, Any], forecaster: Forecaster, fallen_height:
     capacity = max(values["latency_frames"] // every, 1)
     latency = LatencyTable(STAGES, capacity, ("forecast", "forecast_delay"))
 
-    futures = LiveFutures(forecaster.env, forecaster.actor, forecaster.regressor, settings, fallen_height)
+    made = forecaster
+    futures = LiveFutures(made.env, made.actor, made.regressor, settings, fallen_height, made.curves)
     size, humanoid = forecaster.flow_size, forecaster.env.base_env.problem.humanoid
     still = np.zeros((futures.context, 2, size, size), np.float32)
     standing = humanoid.skeleton.rest_qpos()

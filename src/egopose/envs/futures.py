@@ -117,14 +117,29 @@ class FollowFuture(Transform):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Writes :attr:`out_keys` from the raw ``humanoid_state`` and the episode's clock."""
         start, step = tensordict["episode_start"].squeeze(-1), tensordict["episode_step"].squeeze(-1)
+        now, following, targets, later = self.curve(start, step)
+        tensordict.set("followed_targets", targets)
+        tensordict.set("tracking_error", self.error(tensordict["humanoid_state"], now, following))
+        return tensordict.set("visual_context", later)
+
+    def curve(self, start: Tensor, step: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """What does not depend on the body, at ``step [N]`` of the curves that begin at global frames ``start [N]``.
+
+        Returns:
+            The curve's states z ``[N, S]`` there and at the next step, ``followed_targets [N, nu]`` and
+            ``visual_context [N, P * steps ahead]``.
+        """
         now, following = self.futures.states(start, step), self.futures.states(start, step + 1)
         size = self.futures.coefficients.shape[-1]
         angles, rates = following[..., 5 : size - 6], following[..., size:]
-        tensordict.set("followed_targets", (angles.double() + self.lag * rates - self.rest).float())
-        error = torch.stack([tensordict["humanoid_state"] - now, following - now], dim=-2).div_(self.scale)
-        tensordict.set("tracking_error", error.clamp_(-self.clip, self.clip).flatten(-2))
+        targets = (angles.double() + self.lag * rates - self.rest).float()
         later = [self.futures.poses(start, step + ahead) / self.scale[:size] for ahead in self.ahead]
-        return tensordict.set("visual_context", torch.cat(later, dim=-1))
+        return now, following, targets, torch.cat(later, dim=-1)
+
+    def error(self, state: Tensor, now: Tensor, following: Tensor) -> Tensor:
+        """``tracking_error [N, 2 S]`` of the raw ``state [N, S]`` against the curve's, see :meth:`curve`."""
+        error = torch.stack([state - now, following - now], dim=-2).div_(self.scale)
+        return error.clamp_(-self.clip, self.clip).flatten(-2)
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         return self.forward(next_tensordict)

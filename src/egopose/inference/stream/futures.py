@@ -10,7 +10,6 @@ import math
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import torch
@@ -21,12 +20,13 @@ from torchrl.envs import TransformedEnv
 from torchrl.modules import LSTMModule
 
 from egopose.envs.env import EgoPoseEnv
+from egopose.envs.futures import FollowFuture
 from egopose.envs.transforms import StateNormalizer
 from egopose.errors import InputError
 from egopose.inference.bands import quantile_bands
 from egopose.inference.estimator import prepare_for_test
+from egopose.inference.stream.guides import Curves, Guide, guide_of, parts_of
 from egopose.models.policy import GaussianHead
-from egopose.models.recurrent import PastContext
 from egopose.models.regressor import StateRegressor
 from egopose.motion.rotations import Array
 
@@ -126,6 +126,7 @@ class LiveFutures:
         regressor: of the policy's run, in eval mode.
         settings: see :class:`ForecastSettings`.
         fallen_height: m of the head.
+        curves: of a policy that follows them, see :func:`egopose.motion_forecasts.ForecastCurves`.
 
     Attributes:
         context: C, frames of the past the policy reads.
@@ -141,17 +142,14 @@ class LiveFutures:
         regressor: StateRegressor,
         settings: ForecastSettings,
         fallen_height: float,
+        curves: Curves | None = None,
     ) -> None:
         base = env.base_env
         assert isinstance(base, EgoPoseEnv)
         prepare_for_test(env, actor)
         self._base, self._head, self._physics = base, base.problem.humanoid.head, base.physics
-        past = _parts(actor, PastContext)
-        if len(past) != 1:
-            raise InputError(
-                "forecast.checkpoint", "model.context.source", "is not past: this policy does not forecast"
-            )
-        self._past, self.context, self.settings = past[0].context, past[0].frames, settings
+        self._guide: Guide = guide_of(env, actor, regressor, curves)
+        self.context, self.settings = self._guide.frames, settings
         self._regressor, self._fallen_height = regressor, fallen_height
         dt = base.problem.humanoid.control_dt
         self._kept = math.exp(-dt / settings.noise_time) if settings.noise_time > 0 else 0.0
@@ -164,7 +162,9 @@ class LiveFutures:
     def _traced(self, step: _Step) -> torch.jit.ScriptModule:
         """One call a step, during which Python's lock is free: the live loop would wait at each of forty otherwise."""
         worlds = 1 + self.settings.drawn
-        example = (*self._state(), self._context(torch.zeros(self.context, self._past.feature_size)))
+        still = torch.zeros(self.context, self._regressor.context.feature_size)
+        rows = self._guide.begin(still, self._physics.qpos[0], self._physics.qvel[0], 1).rows
+        example = (*self._state(), rows.expand(worlds, -1).contiguous())
         silent = torch.zeros(worlds, self._physics.model.nu)
         hidden = torch.zeros(2, 1, worlds, self._hidden_size)
         inputs = (*example, silent, hidden, self._base.placed)
@@ -178,10 +178,6 @@ class LiveFutures:
     def _state(self) -> tuple[Tensor, Tensor]:
         return torch.from_numpy(self._physics.qpos), torch.from_numpy(self._physics.qvel)
 
-    def _context(self, features: Tensor) -> Tensor:
-        """``[N, D]`` of the past ``[C, D]``, the same for all worlds."""
-        return self._past(features[None]).expand(1 + self.settings.drawn, -1).contiguous()
-
     @torch.no_grad()
     def roll(self, moment: Moment, lap: Callable[[str], None] = lambda stage: None) -> LiveForecast:
         """The futures of a moment: each frame's flow is encoded once, whatever number of forecasts it serves.
@@ -190,12 +186,12 @@ class LiveFutures:
             moment: see :class:`Moment`.
             lap: told each of :data:`STAGES` but the output when it is done.
         """
-        features = self._features(moment)
+        beginning = self._guide.begin(self._features(moment), moment.qpos, moment.qvel, self.settings.horizon)
         lap("forecast_encoder")
         worlds = 1 + self.settings.drawn
-        state = (torch.from_numpy(part).expand(worlds, -1) for part in (moment.qpos, moment.qvel))
+        state = (torch.from_numpy(part).expand(worlds, -1) for part in (beginning.qpos, beginning.qvel))
         self._base.place(torch.arange(worlds), *state)
-        qpos, heads, broken = self._walk(self._context(features), moment.frame)
+        qpos, heads, broken = self._walk(beginning.rows, moment.frame)
         low = np.flatnonzero(heads < self._fallen_height)
         edges = np.empty((2, 0, qpos.shape[-1] - 7))
         if self.settings.drawn:
@@ -217,9 +213,9 @@ class LiveFutures:
                 self._encoded[frame] = self._regressor.encode(flow)[0]
         return torch.stack([self._encoded[frame] for frame in frames])
 
-    def _walk(self, context: Tensor, frame: int) -> tuple[Array, Array, NDArray[np.bool_]]:
+    def _walk(self, rows_read: Tensor, frame: int) -> tuple[Array, Array, NDArray[np.bool_]]:
         """``qpos [N, H, nq]``, head height ``[H]`` of the mean future (m), ``[N]`` whose physics broke."""
-        worlds, horizon, physics = len(context), self.settings.horizon, self._physics
+        worlds, horizon, physics = 1 + self.settings.drawn, self.settings.horizon, self._physics
         generator = torch.Generator().manual_seed(self.settings.seed + frame)
         # The first world's stays silent: the mean future beside the drawn ones, whose noise goes on over time.
         noise = torch.zeros(worlds, physics.model.nu)
@@ -228,7 +224,8 @@ class LiveFutures:
         rows, heights = np.empty((worlds, horizon, physics.model.nq)), np.empty(horizon)
         last, broken = physics.qpos.copy(), np.zeros(worlds, dtype=bool)
         for step in range(horizon):
-            target, hidden = self._step(*self._state(), context, noise, hidden, self._base.placed)
+            read = rows_read[step].expand(worlds, -1)
+            target, hidden = self._step(*self._state(), read, noise, hidden, self._base.placed)
             if worlds > 1:
                 fresh = torch.randn(noise[1:].shape, generator=generator)
                 noise[1:] = self._kept * noise[1:] + math.sqrt(1 - self._kept**2) * fresh
@@ -250,27 +247,43 @@ class _Step(nn.Module):
         super().__init__()
         self._problem = env.base_env.problem
         (self.normalizer,) = (part for part in env.transform if isinstance(part, StateNormalizer))
-        (self.head,) = _parts(actor, GaussianHead)
+        (self.head,) = parts_of(actor, GaussianHead)
         (reader,) = (p for p in actor.modules() if isinstance(p, TensorDictModule) and p.module is self.head)
-        if len(reader.in_keys) != 2:
+        following = [part for part in env.transform if isinstance(part, FollowFuture)]
+        self.follow: FollowFuture | None = following[0] if following else None
+        known = ["tracking_error"] if following else []
+        if list(reader.in_keys[2:]) != known:
             cause = f"a live forecast knows the state and the past, not {', '.join(map(str, reader.in_keys[2:]))}"
             raise InputError("forecast.checkpoint", "model.inputs", cause)
-        memories = _parts(actor, LSTMModule)
+        memories = parts_of(actor, LSTMModule)
         self.memory: nn.LSTM | None = memories[0].lstm if memories else None
         self.hidden_size = 0 if self.memory is None else self.memory.hidden_size
 
     def forward(
         self, qpos: Tensor, qvel: Tensor, context: Tensor, noise: Tensor, hidden: Tensor, placed: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """Targets ``[N, nu]`` float64 and the memory ``[2, 1, N, H]`` after it; ``noise [N, nu]`` in deviations."""
-        read = self.normalizer.normalize(self._problem.observation({"qpos": qpos, "qvel": qvel}).float())
+        """Targets ``[N, nu]`` float64 and the memory ``[2, 1, N, H]`` after it.
+
+        Args:
+            qpos, qvel: ``[N, nq]`` and ``[N, nv]``.
+            context: ``[N, W]`` a row of the guide.
+            noise: ``[N, nu]`` in deviations.
+            hidden: the memory before.
+            placed: ``[N, nu]`` rad, where the bodies were put.
+        """
+        state = self._problem.observation({"qpos": qpos, "qvel": qvel}).float()
+        inputs: tuple[Tensor, ...] = (context,)
+        targets = torch.zeros(())
+        if self.follow is not None:
+            size, joints = state.shape[-1], noise.shape[-1]
+            rest = context.shape[-1] - 2 * size - joints
+            now, following, targets, later = context.split([size, size, joints, rest], dim=-1)
+            inputs = (later, self.follow.error(state, now, following))
+        read = self.normalizer.normalize(state)
         if self.memory is not None:
             out, after = self.memory(read[:, None], (hidden[0], hidden[1]))
             read, hidden = out[:, 0], torch.stack(after)
-        action, scale = self.head(read, context)
+        action, scale = self.head(read, *inputs)
+        action = action + targets
         index = torch.zeros(qpos.shape[0], dtype=torch.int64)
         return self._problem.target(action + scale * noise, index, placed), hidden
-
-
-def _parts(network: nn.Module, kind: type) -> list[Any]:
-    return [part for part in network.modules() if isinstance(part, kind)]
