@@ -7,6 +7,7 @@ import shutil
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -309,6 +310,49 @@ def test_in_a_browser_the_sync_is_moved_by_frames(
         viewer.close()
 
 
+class Gui:
+    """A folder that counts the charts made in it."""
+
+    visible = True
+
+    def __init__(self) -> None:
+        self.made: list[Any] = []
+
+    def add_folder(self, title: str) -> Gui:
+        return self
+
+    def add_uplot(self, data: Any, series: Any, scales: Any, **other: Any) -> Any:
+        self.made.append(SimpleNamespace(data=data, scales=scales, remove=lambda: None))
+        return self.made[-1]
+
+    def __enter__(self) -> None: ...
+
+    def __exit__(self, *error: object) -> None: ...
+
+
+def test_lines_that_change_all_the_time_stay_one_chart() -> None:
+    pytest.importorskip("viser", reason="viser is not installed: pip install 'egopose[view]'")
+    from egopose.viewer.curves import Chart
+
+    gui = Gui()
+    chart: Any = Chart(gui, "V")  # type: ignore[arg-type]
+    for k in range(5):
+        chart.set({"value": (np.sin(np.arange(10.0) + k), "red")}, 10.0, begin=-0.9, now=9)
+    (made,) = gui.made
+    time, values, now = made.data
+    np.testing.assert_allclose(time[[0, -1]], [-0.9, 0.0])
+    np.testing.assert_allclose(values, np.sin(np.arange(10.0) + 4))
+    assert now.argmax() == 9
+    for scale in (1000.0, 0.001):
+        chart.set({"value": (scale * np.sin(np.arange(10.0)), "red")}, 10.0)
+        low, high = made.scales["y"]["range"]
+        assert 2 * scale < high - low < 5 * scale
+    chart.set({"other": (np.ones(3), "red")}, 10.0)
+    assert len(gui.made) == 2
+    chart.set({"other": (np.full(3, np.nan), "red")}, 10.0)
+    assert not gui.visible
+
+
 def test_a_stream_is_shown_live() -> None:
     pytest.importorskip("viser", reason="viser is not installed: pip install 'egopose[view]'")
     from egopose.inference.stream.body import LivePose
@@ -351,7 +395,8 @@ def test_a_stream_is_shown_live() -> None:
             time.sleep(0.02)
         row = 7 + 12 - 5 - 1
         posed = forward_kinematics(motion.skeleton, turning[row][None])
-        expected = viewer._surface.posed(posed[0][0], posed[1][0])
+        root = motion.qpos[7, :3] * [1, 1, 0]  # the body shown stands before the camera
+        expected = viewer._surface.posed(posed[0][0] - root, posed[1][0])
         np.testing.assert_allclose(viewer._ghosts[0].vertices, expected, atol=1e-3)
     finally:
         viewer.close()

@@ -16,7 +16,7 @@ from egopose.viewer.curves import Chart
 from egopose.viewer.door import Address
 from egopose.viewer.figure import Color, Figure
 from egopose.viewer.player import Player
-from egopose.viewer.serving import furnish, open_server
+from egopose.viewer.serving import furnish, open_server, tile
 from egopose.viewer.sync_panel import SyncPanel
 from egopose.viewer.wearer import Pictures
 
@@ -73,7 +73,7 @@ class Viewer:
 
     def _build(self, overrides: Sequence[str]) -> None:
         gui = self._server.gui
-        self._world = furnish(self._server)
+        self._world, self._floor = furnish(self._server)
         labels = list(self._runs)
         self._run: Any = gui.add_dropdown("Run", labels, initial_value=labels[0])
         self._compare = gui.add_dropdown("Compare", [_NONE, *labels], initial_value=_NONE, visible=len(labels) > 1)
@@ -241,6 +241,7 @@ class Viewer:
                 figure.show(frame + ahead, layer["futures"])
             root = self._figures[clips[0][0]].root(frame) if self._follow.value else np.zeros(3)
             self._world.position = (-root[0], -root[1], 0.0)
+            self._floor.position = tile(root)
         picture = None if self._pictures is None else self._pictures.at(frame)
         self._video.visible = picture is not None
         if picture is not None:

@@ -19,11 +19,14 @@ from egopose.motion.rotations import Array
 from egopose.viewer.curves import Chart
 from egopose.viewer.door import Address
 from egopose.viewer.figure import Color
-from egopose.viewer.serving import furnish, open_server
+from egopose.viewer.serving import furnish, open_server, tile
 from egopose.viewer.shapes import surface_of
 
 #: Frames ahead and opacity: the poses of a forecast that are shown, fading.
 AHEAD = ((12, 0.4), (24, 0.26), (45, 0.15), (75, 0.09))
+
+#: Of a frame's message, and the titles of their charts; resets stand in the last.
+CHARTS = {"value": "Value V(s)", "confidence": "Fail-safe: confidence, resets"}
 
 _KEPT = 300  # frames in the charts: 10 s
 _TICK = 1 / 30
@@ -65,9 +68,12 @@ class LiveViewer:
             hello = json.loads(self._stream.recv(timeout=10))
             self._skeleton, self._fps = skeleton_from_json(hello["skeleton"]), float(hello["fps"])
         except (OSError, WebSocketException, ValueError, KeyError, TypeError) as error:
-            raise InputError(source.partition("?")[0], "stream", " ".join(str(error).split())[:200]) from None
+            cause = " ".join(str(error).split())[:200]
+            raise InputError(
+                source.partition("?")[0], "stream", f"{cause}; is `egopose stream` running there?"
+            ) from None
         self._server, self._door, self.url = open_server(address)
-        self._world = furnish(self._server)
+        _, self._floor = furnish(self._server)
         self._surface = surface_of(self._skeleton)
         rest = self._surface.posed(
             *(x[0] for x in forward_kinematics(self._skeleton, self._skeleton.rest_qpos()[None]))
@@ -82,12 +88,12 @@ class LiveViewer:
             for ahead, opacity in AHEAD
         ]  # fmt: skip
         self._status = gui.add_markdown("waiting")
-        self._charts = {n: Chart(gui, n) for n in ("value", "confidence")}
+        self._charts = {n: Chart(gui, title) for n, title in CHARTS.items()}
         joints = self._skeleton.joints
         self._degrees = [f"{joint.name}_{k}" for joint in joints[1:] for k in range(len(joint.dofs))]
         self._joint: Any = gui.add_dropdown("Joint", [_NONE, *self._degrees], initial_value=_NONE, visible=False)
         self._angle = Chart(gui, "Forecast of a joint angle and its band, rad")
-        self._past: dict[str, deque[float]] = {n: deque(maxlen=_KEPT) for n in self._charts}
+        self._past: dict[str, deque[float]] = {n: deque(maxlen=_KEPT) for n in (*CHARTS, "reset")}
         self._newest: dict[str, Any] | None = None
         self._coming: _Coming | None = None
         self._stop = threading.Event()
@@ -127,27 +133,39 @@ class LiveViewer:
             self.frame = int(newest["frame"])
             qpos = np.array(newest["qpos"], dtype=np.float64)[None]
             coming = self._coming
+            # The bodies come to the camera, not the camera to them: a slow browser shows new meshes late.
+            root = qpos[0, :3] * [1.0, 1.0, 0.0]
+            positions, quats = (x[0] for x in forward_kinematics(self._skeleton, qpos))
             with self._server.atomic():
-                self._mesh.vertices = self._surface.posed(*(x[0] for x in forward_kinematics(self._skeleton, qpos)))
-                self._world.position = (-qpos[0, 0], -qpos[0, 1], 0.0)
+                self._mesh.vertices = self._surface.posed(positions - root, quats)
+                self._floor.position = tuple(np.subtract(tile(root), root))
                 if coming is not None:
-                    self._show_ahead(coming)
+                    self._show_ahead(coming, root)
             self._status.content = f"live, frame {self.frame}, {newest['delay_ms']:.0f} ms behind"
             shown += 1
             if shown % _CHARTS_EVERY == 0:
-                for name, chart in self._charts.items():
-                    chart.set({name: (np.array(self._past[name]), f"rgb{_BODY}")}, self._fps)
+                self._chart_past()
                 if coming is not None:
                     self._chart_ahead(coming)
         self._status.content = f"ended after frame {self.frame}"
 
-    def _show_ahead(self, coming: _Coming) -> None:
+    def _chart_past(self) -> None:
+        """The last seconds, up to 0 s."""
+        past = {name: np.array(values) for name, values in self._past.items()}
+        for name, chart in self._charts.items():
+            lines = {name: (past[name], f"rgb{_BODY}")}
+            if name == "confidence" and past["reset"].any():
+                lines["resets"] = (past["reset"], "#d33")
+            last = len(past[name]) - 1
+            chart.set(lines, self._fps, begin=-last / self._fps, now=last)
+
+    def _show_ahead(self, coming: _Coming, root: Array) -> None:
         """The poses some frames after the one shown, as far as the newest forecast reaches."""
         for ghost, (ahead, _) in zip(self._ghosts, AHEAD, strict=True):
             row = self.frame + ahead - coming.frame - 1
             ghost.visible = 0 <= row < len(coming.qpos)
             if ghost.visible:
-                ghost.vertices = self._surface.posed(coming.positions[row], coming.quats[row])
+                ghost.vertices = self._surface.posed(coming.positions[row] - root, coming.quats[row])
         self._joint.visible = True
         self.forecast = coming.frame
 
@@ -159,7 +177,8 @@ class LiveViewer:
                 low, high = (edge[:, column] for edge in coming.bands)
                 lines = {"high": (high, "#9ab"), "low": (low, "#9ab")}
             lines["forecast"] = (coming.qpos[:, 7 + column], f"rgb{_BODY}")
-        self._angle.set(lines, self._fps, ("high", "low"))
+        behind = self.frame - coming.frame - 1
+        self._angle.set(lines, self._fps, ("high", "low"), begin=-behind / self._fps, now=behind)
 
     def close(self) -> None:
         """Leave the stream and serve no more."""

@@ -5,8 +5,10 @@ from __future__ import annotations
 import io
 from contextlib import redirect_stdout
 
+import numpy as np
 import viser
 
+from egopose.motion.rotations import Array
 from egopose.viewer.door import Address, Door
 
 
@@ -34,14 +36,19 @@ def open_server(address: Address) -> tuple[Server, Door, str]:
     return server, door, f"http://{shown}:{door.port}/" + (f"?token={address.token}" if address.token else "")
 
 
-def furnish(server: Server) -> viser.FrameHandle:
-    """A floor and the first look; returns the frame all bodies stand in."""
+def furnish(server: Server) -> tuple[viser.FrameHandle, viser.GridHandle]:
+    """A floor and the first look; returns the frame all bodies stand in, and the floor."""
     server.gui.configure_theme(show_logo=False, show_share_button=False, control_width="large")
     server.gui.main_panel.dock_right()
     server.scene.set_up_direction("+z")
     world = server.scene.add_frame("/world", show_axes=False)
     cell, section = (215, 215, 215), (180, 180, 180)
-    server.scene.add_grid("/world/floor", width=20, height=20, cell_color=cell, section_color=section)
+    floor = server.scene.add_grid("/world/floor", width=20, height=20, cell_color=cell, section_color=section)
     server.initial_camera.position = (2.6, -2.2, 1.5)
     server.initial_camera.look_at = (0.0, 0.0, 0.9)
-    return world
+    return world, floor
+
+
+def tile(root: Array) -> tuple[float, float, float]:
+    """Where the floor is under ``root [3]``, its lines staying where they are: it ends ten metres from its middle."""
+    return float(np.round(root[0])), float(np.round(root[1])), 0.0

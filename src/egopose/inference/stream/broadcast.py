@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import hmac
 import ipaddress
+import logging
 import re
 import threading
 from collections import deque
@@ -150,6 +151,9 @@ class Broadcast:
     async def _serve(self) -> None:
         from websockets.asyncio.server import serve
 
+        # Whoever knocks without speaking WebSocket is turned away; that is no fault of the stream, and no news.
+        logger = logging.getLogger(f"{__name__}.server")
+        logger.setLevel(logging.CRITICAL)
         origins: Iterable[re.Pattern[str] | None] | None = None
         if self._settings.token is None:
             origins = [None, _LOCAL_PAGE]
@@ -164,6 +168,7 @@ class Broadcast:
                 max_queue=1,
                 compression=None,
                 close_timeout=2,
+                logger=logger,
             )
         except OSError as error:
             self._failed = error
