@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import gc
 import logging
+import multiprocessing
 import os
+import threading
 import warnings
 from functools import cache
 from typing import Any
@@ -23,6 +25,22 @@ def prepare_runtime() -> None:
     os.environ.setdefault("GOMP_SPINCOUNT", "0")
     warnings.filterwarnings("ignore", message=".*DISPLAY environment variable", module="glfw")
     logging.getLogger("absl").setLevel(logging.WARNING)
+
+
+def end_with_parent() -> None:
+    """Call in a process that works for another: it ends as soon as that one is gone, whatever it is doing then.
+
+    A process that is killed cannot tell those it started. Does nothing in a process that Python did not start.
+    """
+    parent = multiprocessing.parent_process()
+    if parent is None:
+        return
+
+    def wait() -> None:
+        parent.join()
+        os._exit(1)
+
+    threading.Thread(target=wait, name="end-with-parent", daemon=True).start()
 
 
 def settle_heap() -> None:

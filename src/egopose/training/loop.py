@@ -25,6 +25,7 @@ from egopose.training.collectors import CollectorSettings
 from egopose.training.exploration import SigmaSchedule
 from egopose.training.logging import ProgressLine, Scalars
 from egopose.training.ppo import PPO, TrainingDiverged
+from egopose.training.workers import WorkerLost
 
 Evaluation = Callable[[int], Mapping[str, float]]
 
@@ -44,10 +45,6 @@ class BackgroundEvaluation(Protocol):
 
 class TrainingStopped(RuntimeError):
     """Something outside the run ended it: a full disk, a process that was killed. Its checkpoints are whole."""
-
-
-class WorkerLost(RuntimeError):
-    """A process that collects has ended."""
 
 
 @dataclass(frozen=True)

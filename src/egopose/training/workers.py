@@ -8,6 +8,7 @@ where its worlds stand, and gets the statistics of all workers back.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from functools import partial
 from typing import Any
 
@@ -20,13 +21,17 @@ from torchrl.envs import EnvBase, TransformedEnv
 
 from egopose.envs.transformed import key_path
 from egopose.errors import InputError
-from egopose.runtime import prefer_quick_products
+from egopose.runtime import end_with_parent, prefer_quick_products
 from egopose.training.moments import merge_states, without_counts
 
 State = dict[str, Any]
 
 #: Ray's collector ends at a number of frames and takes no "never"; at a million a second this is 290 thousand years.
 _ENDLESS = 2**63 - 1
+
+
+class WorkerLost(RuntimeError):
+    """A process that collects has ended."""
 
 
 def base_env(env: EnvBase) -> EnvBase:
@@ -38,8 +43,11 @@ def base_env(env: EnvBase) -> EnvBase:
 
 def read_simulation(collector: Collector) -> State:
     """Where every world of a collector's own environment stands, and what the policy will see next."""
-    # TorchRL keeps the observation after the last step, and nothing else tells it, in `_carrier`.
+    # TorchRL keeps the observation after the last step, and nothing else tells it, in `_carrier`. Beside it stand the
+    # numbers of the episodes: workers draw them from one pool, whoever comes first, and nothing here reads them.
+    # Sorted: in which order they stand depends on how often the worlds were stepped.
     seen = {".".join(key_path(key)): value.clone() for key, value in collector._carrier.items(True, True)}
+    seen = {name: seen[name] for name in sorted(seen) if not name.startswith("collector.")}
     return {"carrier": seen, "worlds": dict(base_env(collector.env).state_dict())}
 
 
@@ -74,6 +82,10 @@ class WorkerCollector(Collector):
         state = _unpacked(packed)
         write_simulation(self, state)
         torch.set_rng_state(state["rng"])
+
+    def policy_state(self) -> State:
+        """The parameters it acts by, packed."""
+        return _packed(self.policy.state_dict())
 
 
 class _AnnouncingCollector(MultiAsyncCollector):
@@ -144,7 +156,7 @@ class Workers:
                 auto_register_policy_transforms=False,
             )
         self.update_policy_weights_()
-        reports = self._reports()
+        reports = self.reports()
         self.simulation: list[State] = [report["simulation"] for report in reports]
         # What the workers' first resets counted is still theirs to report.
         self.transforms = without_counts(reports[0]["transforms"])
@@ -158,13 +170,15 @@ class Workers:
             if self.kind == "multi_async":
                 yield torch.cat([next(batches) for _ in range(self.count)])
                 continue
-            batch = next(batches)
+            with self._ray_watch():
+                batch = next(batches)
             self._exchange_all()
             yield batch.flatten(0, 1) if self.kind == "ray" else batch
 
     def update_policy_weights_(self) -> None:
         """Send the policy's present parameters to all workers."""
-        self._collector.update_policy_weights_(self.policy)
+        with self._ray_watch():
+            self._collector.update_policy_weights_(self.policy)
 
     def load_transform_state(self, state: Mapping[str, Any]) -> None:
         """Give all workers these statistics. Before the first batch only: a busy worker would lose its batch."""
@@ -183,6 +197,14 @@ class Workers:
         self._call_all("load_simulation_state", [(_packed(state),) for state in states])
         self.simulation = [dict(state) for state in states]
 
+    def reports(self) -> list[State]:
+        """What every worker holds, see :meth:`WorkerCollector.report`. Not while one is busy."""
+        return [_unpacked(report) for report in self._call_all("report")]
+
+    def policy_states(self) -> list[State]:
+        """The parameters every worker acts by. Not while one is busy."""
+        return [_unpacked(state) for state in self._call_all("policy_state")]
+
     def shutdown(self) -> None:
         """End the workers, and the Ray cluster where it was started for them."""
         self._collector.shutdown()
@@ -190,12 +212,14 @@ class Workers:
             self._end_ray()
 
     def _exchange_all(self) -> None:
-        reports = self._reports()
-        self.simulation = [report["simulation"] for report in reports]
+        reports = self.reports()
         states = [report["transforms"] for report in reports]
-        self.transforms = merge_states(self.transforms, states, self._given)
-        self._call_all("load_transform_state", [(_packed(self.transforms),)] * self.count)
-        self._given = [self.transforms] * self.count
+        merged = merge_states(self.transforms, states, self._given)
+        self._call_all("load_transform_state", [(_packed(merged),)] * self.count)
+        # Last: where a worker is missed before, what is saved stands where the iteration before ended.
+        self.simulation = [report["simulation"] for report in reports]
+        self.transforms = merged
+        self._given = [merged] * self.count
 
     def _exchange(self, number: int) -> None:
         report = _unpacked(self._call(number, "report"))
@@ -204,11 +228,36 @@ class Workers:
         self._call(number, "load_transform_state", _packed(self.transforms))
         self._given[number] = self.transforms
 
-    def _reports(self) -> list[State]:
-        return [_unpacked(report) for report in self._call_all("report")]
-
     def _call_all(self, method: str, arguments: list[tuple[Any, ...]] | None = None) -> list[Any]:
-        return self._collector.map_fn(method, arguments)
+        with self._ray_watch():
+            return list(self._collector.map_fn(method, arguments))
+
+    @contextmanager
+    def _ray_watch(self) -> Iterator[None]:
+        """Raises :class:`WorkerLost` where Ray has lost a worker; of processes here the loop hears by itself."""
+        if self.kind != "ray":
+            yield
+            return
+        from ray.exceptions import RayActorError
+
+        try:
+            yield
+        except (RayActorError, RuntimeError) as error:
+            # Weights take another way than Ray's own, on which only a connection breaks: Ray knows who lives.
+            gone = error if isinstance(error, RayActorError) else self._ray_says()
+            if gone is None:
+                raise
+            raise WorkerLost(f"a worker of Ray ended: {str(gone).splitlines()[0]}") from error
+
+    def _ray_says(self) -> Exception | None:
+        """What Ray answers where one of its workers is gone."""
+        from ray.exceptions import RayActorError
+
+        try:
+            self._collector.get_distant_attr("closed")
+        except RayActorError as error:
+            return error
+        return None
 
     def _call(self, number: int, method: str, *arguments: Any) -> Any:
         # TorchRL asks all workers or none; this is what its `map_fn` does, for one.
@@ -221,6 +270,7 @@ class Workers:
 
 
 def _seeded(make_env: Callable[[int], EnvBase], seed: int, number: int) -> EnvBase:
+    end_with_parent()  # of itself it would look only after its batch; Ray ends its workers by its own means
     prefer_quick_products()
     torch.manual_seed((seed * 1000 + 1 + number) % 2**63)
     return make_env(number)
