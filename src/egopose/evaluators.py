@@ -23,6 +23,7 @@ from egopose.envs.trial import trial_env, trial_figures
 from egopose.errors import InputError
 from egopose.material import Material
 from egopose.pipeline import build_env, build_networks, load_agent
+from egopose.runtime import end_with_parent
 from egopose.training.checkpoint import find_checkpoint, read_json
 from egopose.training.collectors import transform_state
 from egopose.training.loop import Run, interrupts_held
@@ -89,6 +90,7 @@ def _evaluator(make_env: Any, make_policy: Any, backend: str, worlds: int, steps
 
 def _one_thread() -> None:
     """In a process of its own: the cores are for training."""
+    end_with_parent()
     torch.set_num_threads(1)
 
 

@@ -7,7 +7,7 @@ would take hours to show it.
 
 from __future__ import annotations
 
-from egopose.runtime import prepare_runtime
+from egopose.runtime import end_with_parent, prepare_runtime
 
 prepare_runtime()
 
@@ -179,7 +179,7 @@ def gate_sources(
     if workers == 1:
         yield from zip((s.name for s in sources), map(work, sources), strict=True)
         return
-    with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
+    with ProcessPoolExecutor(workers, mp_context=get_context("spawn"), initializer=end_with_parent) as pool:
         yield from zip((s.name for s in sources), pool.map(work, sources), strict=True)
 
 

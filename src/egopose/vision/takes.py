@@ -15,6 +15,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from egopose.errors import InputError
 from egopose.motion.rotations import Array
+from egopose.runtime import end_with_parent
 from egopose.untrusted import read_json
 from egopose.vision.corruption import Corruption
 from egopose.vision.gl import choose_backend
@@ -153,7 +154,8 @@ def render_takes(jobs: Sequence[RenderJob], config: RenderConfig, workers: int, 
                 bar.advance(task, render_take(job, config))
             return len(todo)
         # Spawned and not forked: neither OpenGL nor a parent's threads survive a fork.
-        with ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context("spawn")) as pool:
+        context = multiprocessing.get_context("spawn")
+        with ProcessPoolExecutor(workers, mp_context=context, initializer=end_with_parent) as pool:
             # Longest first, so that no worker is left with a long take at the end.
             ordered = sorted(todo, key=lambda job: -len(job.qpos))
             futures = [pool.submit(render_take, job, config) for job in ordered]
