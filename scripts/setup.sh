@@ -44,8 +44,9 @@ make_venv() {
   [ -x "$venv/bin/python" ] || { echo "setup: making $venv with $("$python" --version)"; "$python" -m venv "$venv"; }
   # torch first and by itself: whatever comes after then keeps this build (the CPU build where the index has one)
   # and does not take another of several GB.
-  echo "setup: installing packages (about two minutes the first time)"
+  echo "setup: installing torch, then the rest (two minutes the first time; far more where disk or network is slow)"
   "$venv/bin/python" -m pip install --quiet "torch==2.13.0" || stop "torch 2.13.0 could not be installed; see pip's message above"
+  echo "setup: torch is there; the rest"
   "$venv/bin/python" -m pip install --quiet -e ".[dev]" || stop "the packages of pyproject.toml could not be installed; see pip's message above"
   touch "$venv/.egopose-stamp"
 }

@@ -21,6 +21,11 @@ def call(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
     return int(stopped.value.code or 0)
 
 
+def test_the_version_is_told(monkeypatch, capsys) -> None:
+    assert call(monkeypatch, "--version") == 0
+    assert re.fullmatch(r"egopose \d+\.\d+\.\d+\n", capsys.readouterr().out)
+
+
 def test_help_lists_every_verb(monkeypatch, capsys) -> None:
     assert call(monkeypatch, "--help") == 0
     shown = capsys.readouterr().out

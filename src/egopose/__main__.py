@@ -5,6 +5,7 @@ from __future__ import annotations
 import difflib
 import importlib
 import sys
+from importlib.metadata import version
 
 VERBS = {
     "demo": "train a policy on the default data, evaluate it, show a table and a video",
@@ -30,7 +31,7 @@ def usage() -> str:
     width = max(map(len, VERBS))
     verbs = "\n".join(f"  {verb.ljust(width)}  {what}" for verb, what in VERBS.items())
     more = 'egopose VERB --help says more of one; eval "$(egopose completion bash)" lets the shell complete them.'
-    return f"usage: egopose VERB [key=value ...]\n\n{verbs}\n\n{more}"
+    return f"usage: egopose VERB [key=value ...]\n       egopose --version\n\n{verbs}\n\n{more}"
 
 
 def main() -> None:
@@ -39,6 +40,9 @@ def main() -> None:
     if not arguments or arguments[0] in ("-h", "--help"):
         print(usage())
         raise SystemExit(0 if arguments else 2)
+    if arguments[0] == "--version":
+        print(f"egopose {version('egopose')}")
+        raise SystemExit(0)
     verb = arguments[0]
     if verb not in VERBS:
         near = difflib.get_close_matches(verb, VERBS, 1)

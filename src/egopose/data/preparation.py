@@ -218,6 +218,7 @@ def _make_flow(config: Mapping[str, Any], store: TakeStore, progress: bool) -> N
 
     name, settings = flow_name(config), config["vision"]["flow"]
     todo = sorted(set(range(len(store.takes))) - store.flow_done(name))
+    progress = progress and bool(todo)
     table = store.open_flow(name, int(settings["stored_size"]))
     with _bar("optical flow", "frames", progress) as bar:
         task = bar.add_task("flow", total=sum(store.takes[i].length for i in todo))
