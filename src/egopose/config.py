@@ -147,10 +147,11 @@ def explained(name: str, error: HydraException) -> InputError:
             source, key[1], f"is not a setting{meant or f'; the file lists them: {config_dir() / name}.yaml'}"
         )
     if choice := re.search(r"Could not find '([^']+)/([^'/]+)'", said):
-        # Hydra lists them, those of --config-dir too.
+        # Hydra lists them, those of --config-dir too, and after them where it looked.
         _, _, listed = said.partition("Available options in")
-        there = ", ".join(line.strip() for line in listed.splitlines() if line.startswith("\t"))
-        return InputError(source, choice[1], f"there is no {choice[2]!r}; there are {there or 'none'}")
+        there = [line.strip() for line in listed.partition("Config search path")[0].splitlines() if line[:1] == "\t"]
+        cause = f"there is no {choice[2]!r}; there are {', '.join(there) or 'none'}"
+        return InputError(source, choice[1], f"{cause} (and your own: --config-dir DIR)")
     if isinstance(error, OverrideParseException):
         cause = "cannot be read: settings are given as key=value, quoted where the shell needs it"
         return InputError(source, error.override, cause)

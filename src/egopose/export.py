@@ -86,6 +86,8 @@ def motion_files(source: Path, part: str, take: str | None) -> dict[str, Path]:
     Raises:
         InputError: the folder holds none, or not the take or part asked for.
     """
+    if not source.exists():
+        raise InputError(source, "path", "no such file or folder")
     if not source.is_dir():
         return {source.name.split(".")[0]: source}
     if part not in ("estimate", "reference"):
