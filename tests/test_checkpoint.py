@@ -256,6 +256,25 @@ def test_the_last_and_the_best_are_kept(tmp_path: Path) -> None:
     assert checkpoints.verify(checkpoints.find_checkpoint(tmp_path, "best"))["score"] == 9.0
 
 
+def test_the_best_holds_the_very_weights_that_were_judged(tmp_path: Path) -> None:
+    """Evaluations and regular checkpoints fall on other iterations; a score must not stick to later weights."""
+    run = make_run(tmp_path, iterations=8, checkpoint_every=2, keep_last=2, evaluate_every=3)
+    judged = {}
+
+    def evaluate(iteration: int) -> dict[str, float]:
+        judged[iteration] = {key: value.clone() for key, value in run.ppo.actor.state_dict().items()}
+        return {"score": {3: 9.0, 6: 1.0}[iteration]}
+
+    train(run, [], evaluate)
+    best = checkpoints.find_checkpoint(tmp_path, "best")
+    assert checkpoints.verify(best)["iteration"] == 3
+    again = make_run(tmp_path / "again")
+    again.restore(best)
+    assert_equal_trees(judged[3], dict(again.ppo.actor.state_dict()), "actor")
+    scores = [checkpoints.verify(p)["score"] for p in sorted((tmp_path / "checkpoints").iterdir())]
+    assert scores == [9.0, 1.0, checkpoints.NOT_JUDGED]  # of iterations 3, 6 and 8
+
+
 def test_a_failing_save_leaves_the_old_checkpoint(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     run = make_run(tmp_path, iterations=1)
     path = train(run, []).checkpoint

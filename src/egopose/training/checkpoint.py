@@ -32,6 +32,8 @@ from egopose.weights import is_shipped, shipped_run
 SCHEMA = 1
 CHECKSUMS = "checksums.json"
 FOLDER = "checkpoints"
+#: Score of a checkpoint whose weights no evaluation looked at: below any other, so that it never passes for the best.
+NOT_JUDGED = -1e300
 _PREFIX = "checkpoint-"  # of TorchRL's rotation; the control steps follow
 #: Where :func:`recover` puts a checkpoint that is not whole.
 SET_ASIDE = "damaged-"
@@ -157,7 +159,10 @@ class RunCheckpoint(Checkpoint):
 
 
 def metadata_of(task: str, action_size: int, iteration: int, steps: int, score: float) -> dict[str, Any]:
-    """What the manifest says besides TorchRL's own entries; ``score`` decides which checkpoint is the best."""
+    """What the manifest says besides TorchRL's own entries; ``score`` decides which checkpoint is the best.
+
+    It is :data:`NOT_JUDGED` where these weights were not evaluated.
+    """
     from egopose import __version__
 
     return {

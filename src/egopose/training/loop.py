@@ -86,7 +86,12 @@ class LoopSettings:
 
 @dataclass
 class Counters:
-    """Where a run stands; a component of its checkpoints (``trainer_state``)."""
+    """Where a run stands; a component of its checkpoints (``trainer_state``).
+
+    Args:
+        score: of the last evaluation.
+        scored: whether no checkpoint has been written since: the next one is the one it belongs to.
+    """
 
     iteration: int = 0
     frames: int = 0
@@ -94,6 +99,7 @@ class Counters:
     skipped_minibatches: int = 0
     diverged_worlds: int = 0
     score: float = 0.0
+    scored: bool = False
 
 
 @dataclass(frozen=True)
@@ -164,11 +170,13 @@ class Run:
         state = self.counters
         if self._saved is not None and self._saved[0] == state.frames and self._saved[1].is_dir():
             return self._saved[1]
+        score = state.score if state.scored else checkpoints.NOT_JUDGED
+        state.scored = False
         components = self.checkpoint()
         for name in ("policy", "critic", "policy_optimizer", "value_optimizer", "transforms"):
             if (found := _not_finite(components.components[name].state_dict(), name)) is not None:
                 raise TrainingDiverged(f"{found} is not finite")
-        metadata = checkpoints.metadata_of(self.task, self.action_size, state.iteration, state.frames, state.score)
+        metadata = checkpoints.metadata_of(self.task, self.action_size, state.iteration, state.frames, score)
         kept = checkpoints.rotation(self.folder, self.settings.keep_last)
         self._saved = state.frames, kept.save(components, step=state.frames, metadata=metadata)
         return self._saved[1]
@@ -213,8 +221,9 @@ def train(run: Run, loggers: Sequence[Scalars], evaluate: Evaluation | Backgroun
         loggers: get every iteration's figures.
         evaluate: called every ``evaluate_every`` iterations with the iteration's number; its figures are logged under
             ``evaluation/``, and its ``score``, if it gives one, decides which checkpoint is the best (otherwise the
-            mean episode length in training does). One in the background is begun then; its figures are logged at the
-            step it was begun at once they are there, and its score counts for the checkpoints saved from then on.
+            mean episode length in training does); what was judged is saved at once. One in the background is begun
+            then; its figures are logged at the step it was begun at once they are there, and its score counts for the
+            next checkpoint saved.
 
     Raises:
         TrainingDiverged: see :meth:`PPO.update` and :meth:`Run.save`.
@@ -232,12 +241,13 @@ def train(run: Run, loggers: Sequence[Scalars], evaluate: Evaluation | Backgroun
             while (reason := _end(settings, counters, time.monotonic() - begin + slowest, stop)) is None:
                 started = time.monotonic()
                 figures = iterate(run, batches)
-                figures |= _judge(run, figures, evaluate)
+                judged = _judge(run, figures, evaluate)
+                figures |= judged
                 for logger in loggers:
                     logger.write(counters.frames, figures)
                 _log_finished(run, loggers, evaluate)
                 progress.update(counters.iteration, figures)
-                if counters.iteration % settings.checkpoint_every == 0:
+                if judged or counters.iteration % settings.checkpoint_every == 0:
                     run.save()
                 slowest = max(slowest, time.monotonic() - started)
                 counters.seconds += time.monotonic() - started
@@ -284,7 +294,7 @@ def _judge(
     """Evaluate where it is due; keeps the score of the last evaluation, or of training where there is none."""
     counters, every = run.counters, run.settings.evaluate_every
     if evaluate is None or every == 0:
-        counters.score = figures.get("episode_length", counters.score)
+        counters.score, counters.scored = figures.get("episode_length", counters.score), True
         return {}
     if counters.iteration % every != 0:
         return {}
@@ -294,7 +304,8 @@ def _judge(
     # An evaluation draws (and TorchRL seeds) random numbers; training's own must not notice.
     with torch.random.fork_rng(devices=[]):
         result = dict(evaluate(counters.iteration))
-    counters.score = result.get("score", counters.score)
+    if "score" in result:
+        counters.score, counters.scored = result["score"], True
     return _evaluation_figures(result)
 
 
@@ -309,7 +320,8 @@ def _log_finished(
     if not isinstance(evaluate, BackgroundEvaluation):
         return
     for step, result in evaluate.finished(wait):
-        run.counters.score = result.get("score", run.counters.score)
+        if "score" in result:
+            run.counters.score, run.counters.scored = result["score"], True
         for logger in loggers:
             logger.amend(step, _evaluation_figures(result))
 
