@@ -21,15 +21,13 @@ from collections.abc import Mapping, Sequence  # noqa: E402
 from pathlib import Path  # noqa: E402
 from typing import Any  # noqa: E402
 
-import torch  # noqa: E402
-
-from egopose.baselines import load_baseline, path_pose_motion  # noqa: E402
+from egopose.baselines import load_baseline, path_pose_motion, score_motions  # noqa: E402
 from egopose.config import compose_config, from_mapping  # noqa: E402
 from egopose.data.preparation import flow_name, store_folder  # noqa: E402
 from egopose.data.store import TakeStore  # noqa: E402
 from egopose.errors import InputError  # noqa: E402
 from egopose.evaluation.agents import evaluate_agent  # noqa: E402
-from egopose.evaluation.protocols import METRICS, ContactSettings, TakeScores, score_take  # noqa: E402
+from egopose.evaluation.protocols import ContactSettings, raw_figures  # noqa: E402
 from egopose.evaluation.tables import write_json  # noqa: E402
 from egopose.inference.failsafe import FailSafeSettings  # noqa: E402
 from egopose.material import run_material  # noqa: E402
@@ -72,8 +70,8 @@ def judge(run: Path, config: Mapping[str, Any], corruption: Mapping[str, Any]) -
     failsafe = from_mapping(FailSafeSettings, settings["failsafe"], "conf/evaluate.yaml: failsafe")
     found = evaluate_agent(agent, fragments, labels, "test", failsafe, contact, int(settings["threads"]))
     return {
-        method_of(config): _figures([one.scores for one in found]),
-        "posereg": _figures([one.pose_regression_scores for one in found]),
+        method_of(config): raw_figures([one.scores for one in found]),
+        "posereg": raw_figures([one.pose_regression_scores for one in found]),
     }
 
 
@@ -81,27 +79,16 @@ def _path_pose(run: Path, config: Mapping[str, Any], contact: ContactSettings) -
     material, model = run_material(config, run), load_baseline(run).model
     assert isinstance(model, PathPose)
     flow = TakeStore.open(store_folder(config)).flow(flow_name(config))
-    truth, offsets = torch.as_tensor(material.reference["qpos"]).double().numpy(), material.takes.offsets.tolist()
-    scores = []
-    for fragment, label in zip(material.test, _labels(config, material.test), strict=True):
-        motion = path_pose_motion(model, flow, material, fragment, label)
-        first = offsets[fragment.take] + fragment.start
-        scores.append(score_take(label, motion.qpos, truth[first : first + len(motion)], material.humanoid, contact))
-    return _figures(scores)
+    labels = _labels(config, material.test)
+    motions = [
+        path_pose_motion(model, flow, material, f, label) for f, label in zip(material.test, labels, strict=True)
+    ]
+    return raw_figures(score_motions(motions, material.test, material, contact))
 
 
 def _labels(config: Mapping[str, Any], fragments: Sequence[Any]) -> list[str]:
-    takes = TakeStore.open(store_folder(config)).takes
-    return [f"{takes[f.take].name}_{f.start}-{f.stop}" for f in fragments]
-
-
-def _figures(scores: Sequence[TakeScores]) -> Result:
-    return {
-        "takes": [one.name for one in scores],
-        "figures": {m.key: [m.scale * one.figure(m.key) for one in scores] for m in METRICS},
-        "resets": [one.resets for one in scores],
-        "frames": [len(one.frames["E_pose"]) for one in scores],
-    }
+    store = TakeStore.open(store_folder(config))
+    return [store.fragment_name(fragment) for fragment in fragments]
 
 
 def judge_all(runs: Sequence[Path], corruptions: Sequence[str], results: Path, workers: int | None = None) -> None:

@@ -13,13 +13,13 @@ import torch
 from study import Job
 
 from egopose.baseline import run_baseline_job
-from egopose.baselines import forecast_qpos, load_baseline, path_pose_motion, regressed_motion
+from egopose.baselines import forecast_qpos, load_baseline, path_pose_motion, regressed_motion, score_motions
 from egopose.config import compose_config, from_mapping
 from egopose.data.preparation import flow_name, store_folder
 from egopose.data.store import TakeStore
 from egopose.evaluation.agents import evaluate_agent
 from egopose.evaluation.forecasting import ForecastWindow, forecast_windows, score_forecasts, true_futures
-from egopose.evaluation.protocols import METRICS, ContactSettings, TakeScores, score_take
+from egopose.evaluation.protocols import ContactSettings, raw_figures
 from egopose.evaluation.survival import base_tracking, frames_survived, reference_tracking
 from egopose.evaluation.tables import write_json
 from egopose.forecast_contexts import past_states
@@ -100,14 +100,14 @@ def _material(folder: Path, config: dict[str, Any], judged: dict[str, Any]) -> M
 
 
 def _labels(config: dict[str, Any], fragments: Sequence[Any]) -> list[str]:
-    takes = TakeStore.open(store_folder(config)).takes
-    return [f"{takes[f.take].name}_{f.start}-{f.stop}" for f in fragments]
+    store = TakeStore.open(store_folder(config))
+    return [store.fragment_name(fragment) for fragment in fragments]
 
 
 def _estimates(
     job: Job, folder: Path, config: dict[str, Any], judged: dict[str, Any], settings: dict[str, Any]
 ) -> Result:
-    """Figures of every held-out fragment: ``figures[metric][take]`` in the units of METRICS, ``resets[take]``."""
+    """Figures of every held-out fragment, see :func:`egopose.evaluation.protocols.raw_figures`."""
     contact = from_mapping(ContactSettings, settings["contact"], "conf/evaluate.yaml: contact")
     if job.verb == "train":
         other = {} if judged is config else {key: judged[key] for key in ("data", "vision")}
@@ -119,7 +119,7 @@ def _estimates(
         found = evaluate_agent(agent, fragments, labels, "test", failsafe, contact, int(settings["threads"]))
         diverged = sum(one.estimate.diverged for one in found)
         survival = {"survival": _survival(agent, settings)} if job.survival else {}
-        return _figures([one.scores for one in found]) | {"diverged": int(diverged)} | survival
+        return raw_figures([one.scores for one in found]) | {"diverged": int(diverged)} | survival
     material = _material(folder, config, judged)
     fragments = list(material.test)
     labels = _labels(judged, fragments)
@@ -132,13 +132,7 @@ def _estimates(
         motions = [
             path_pose_motion(model, flow, material, f, label) for f, label in zip(fragments, labels, strict=True)
         ]
-    truth, offsets = torch.as_tensor(material.reference["qpos"]).double().numpy(), material.takes.offsets.tolist()
-    scores = []
-    for fragment, motion in zip(fragments, motions, strict=True):
-        first = offsets[fragment.take] + fragment.start
-        reference = truth[first : first + len(motion)]
-        scores.append(score_take(motion.name, motion.qpos, reference, material.humanoid, contact))
-    return _figures(scores)
+    return raw_figures(score_motions(motions, fragments, material, contact))
 
 
 def _survival(agent: Agent, settings: dict[str, Any]) -> dict[str, list[int]]:
@@ -152,15 +146,6 @@ def _survival(agent: Agent, settings: dict[str, Any]) -> dict[str, list[int]]:
     out = {name: frames_survived(env, controller, seed).frames.tolist() for name, controller in acting.items()}
     env.close()
     return out
-
-
-def _figures(scores: Sequence[TakeScores]) -> Result:
-    return {
-        "takes": [one.name for one in scores],
-        "figures": {m.key: [m.scale * one.figure(m.key) for one in scores] for m in METRICS},
-        "resets": [one.resets for one in scores],
-        "frames": [len(one.frames["E_pose"]) for one in scores],
-    }
 
 
 def _forecasts(

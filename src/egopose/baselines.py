@@ -21,6 +21,7 @@ from egopose.envs.mdp.observations import humanoid_state
 from egopose.envs.starts import FragmentLike
 from egopose.errors import InputError
 from egopose.evaluation.forecasting import ForecastWindow
+from egopose.evaluation.protocols import ContactSettings, TakeScores, score_take
 from egopose.files import write_text_whole
 from egopose.material import Material, load_material, run_material
 from egopose.models.baselines.path_pose import PathPose
@@ -212,6 +213,17 @@ def regressed_motion(material: Material, fragment: FragmentLike, name: str = "")
     rows = _rows(material, fragment)
     assert material.states is not None
     return _placed(material.states[rows].numpy(), material, rows, name)
+
+
+def score_motions(
+    motions: Sequence[Motion], fragments: Sequence[FragmentLike], material: Material, contact: ContactSettings
+) -> list[TakeScores]:
+    """Figures of a kinematic method's motions, one a fragment, against the reference."""
+    truth: Array = torch.as_tensor(material.reference["qpos"]).double().numpy()
+    return [
+        score_take(motion.name, motion.qpos, truth[_rows(material, fragment)], material.humanoid, contact)
+        for motion, fragment in zip(motions, fragments, strict=True)
+    ]
 
 
 def _rows(material: Material, fragment: FragmentLike) -> slice:
