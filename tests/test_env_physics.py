@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import gc
+import threading
 from pathlib import Path
 
 import mujoco
@@ -9,7 +11,7 @@ import numpy as np
 import pytest
 from humanoid_stand_in import stand_in
 
-from egopose.humanoid.physics import BatchedPhysics
+from egopose.humanoid.physics import BatchedPhysics, _Worker
 
 
 @pytest.fixture(scope="module")
@@ -57,6 +59,48 @@ def test_threads_do_not_matter(humanoid) -> None:
         one.step(ctrl)
         two.step(ctrl)
     np.testing.assert_array_equal(one.state, two.state)
+
+
+def test_parts_of_the_worlds_may_be_under_way_together(humanoid) -> None:
+    """Ranges that no thread's share divides, two begun before the first is waited for: the same to the bit."""
+    whole, parts = started(humanoid, 21), started(humanoid, 21, threads=2)
+    ranges = (slice(0, 13), slice(13, 21))
+    wrench = np.random.default_rng(2).uniform(-50.0, 50.0, (21, 6))
+    for ctrl in controls(humanoid, 21, 4):
+        whole.step(ctrl, wrench)
+        for worlds in ranges:
+            parts.begin_step(ctrl[worlds], worlds, wrench[worlds])
+        for worlds in ranges:
+            assert not parts.end_step(worlds).any()
+    np.testing.assert_array_equal(whole.state, parts.state)
+    np.testing.assert_array_equal(whole.body_state()["xpos"][13:], parts.body_state(ranges[1])["xpos"])
+    parts.close()
+
+
+def test_a_threads_error_reaches_who_waits(humanoid, monkeypatch) -> None:
+    physics, ctrl = started(humanoid, 4, threads=2), controls(humanoid, 4, 1)[0]
+    with monkeypatch.context() as broken:
+        broken.setattr(_Worker, "step", lambda *_: 1 / 0)
+        physics.begin_step(ctrl)
+        with pytest.raises(ZeroDivisionError):
+            physics.end_step()
+        with pytest.raises(ZeroDivisionError):
+            physics.step(ctrl)
+    assert not physics.step(ctrl).any()
+
+
+def test_threads_end_with_the_physics(humanoid) -> None:
+    before = set(threading.enumerate())
+    physics = started(humanoid, 4, threads=2)
+    physics.begin_step(controls(humanoid, 4, 1)[0])
+    physics.end_step()
+    serving = set(threading.enumerate()) - before
+    assert len(serving) == 2
+    del physics
+    gc.collect()
+    for thread in serving:
+        thread.join(5.0)
+        assert not thread.is_alive()
 
 
 def test_a_saved_state_resumes_to_the_bit(humanoid) -> None:

@@ -27,14 +27,14 @@ class StepRecorder:
         begin: Any = self.physics._begin
         parts: list[tuple[Array, Array]] = []
 
-        def recorded(ctrl: Array, worlds: slice, threads: int, wrench: Array | None) -> Any:
+        def recorded(ctrl: Array, worlds: slice, wrench: Array | None) -> Any:
             parts.append((self.physics.state[worlds].copy(), ctrl.copy()))
             # Ranges of worlds take turns, in order.
             if sum(len(part) for _, part in parts) == self.physics.n_worlds:
                 for record, columns in zip((self.states, self.ctrls), zip(*parts, strict=True), strict=True):
                     record.append(np.concatenate(columns))
                 parts.clear()
-            return begin(ctrl, worlds, threads, wrench)
+            return begin(ctrl, worlds, wrench)
 
         self.physics._begin = recorded  # type: ignore[method-assign]
 
