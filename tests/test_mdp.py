@@ -228,6 +228,19 @@ def test_the_reference_itself_is_worth_one(body, reward: rewards.Reward) -> None
     np.testing.assert_allclose(obs.humanoid_state(flipped), obs.humanoid_state(reference), atol=1e-12)
 
 
+def test_the_state_of_a_few_rows_is_the_same(body) -> None:
+    """As arrays: to the last digits; rows round alike however many there are; and where no heading is left."""
+    _, reference, _ = body
+    qpos, qvel = reference["qpos"].numpy(), reference["qvel"].numpy()
+    rows = obs.humanoid_state_rows(qpos, qvel)
+    np.testing.assert_allclose(rows, obs.humanoid_state(reference), rtol=1e-14, atol=1e-15)
+    for few in (slice(0, 1), slice(3, 10)):
+        np.testing.assert_array_equal(obs.humanoid_state_rows(qpos[few], qvel[few]), rows[few])
+    half_turn = qpos[:1].copy()
+    half_turn[:, 3:7] = [[0.0, 0.6, 0.8, 0.0]]
+    np.testing.assert_allclose(obs.humanoid_state_rows(half_turn, qvel[:1])[0, 1:5], [0.0, 0.6, 0.8, 0.0], atol=1e-15)
+
+
 def test_total_is_divided_by_the_weights(body) -> None:
     _, reference, layout = body
     a, b, step = reference[:10], reference[10:20], torch.zeros(10)

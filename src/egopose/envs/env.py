@@ -20,6 +20,8 @@ from egopose.envs.problem import ImitationProblem
 from egopose.envs.starts import AdaptiveStarts, Starts
 from egopose.humanoid.physics import ALL, Array, BatchedPhysics
 
+Counter = NDArray[np.int64]
+
 _STEPS_REWARDED_AT_ONCE = 8  # of all worlds: measured, at 64 worlds; twice or half as many are as quick
 
 
@@ -37,6 +39,13 @@ def _joined(steps: list[_Unrewarded]) -> _Unrewarded:
     state = {key: torch.cat([step.state[key] for step in steps]) for key in steps[0].state}
     frame, step, diverged = (torch.cat(column) for column in list(zip(*steps, strict=True))[1:])
     return _Unrewarded(state, frame, step, diverged)
+
+
+def _replaced(counter: Counter, rows: NDArray[np.integer] | slice, values: Counter) -> Counter:
+    """A copy of ``counter`` with ``values`` in ``rows``."""
+    counter = counter.copy()
+    counter[rows] = values
+    return counter
 
 
 def _no_flags(size: torch.Size) -> dict[str, Tensor]:
@@ -102,8 +111,9 @@ class EgoPoseEnv(EnvBase):
         self._assistance = None if assist is None else RootAssistance(assist, problem.reference)
         self._workers = workers
         self._generator = torch.Generator().manual_seed(seed)
-        counter = torch.zeros(n_worlds, dtype=torch.int64)
-        self._take, self._start, self._stop, self._frame = (counter.clone() for _ in range(4))
+        # Arrays, as everything that is worked out for the few worlds of a step but what is put in entries: an operator
+        # of torch costs several times as much.
+        self._take, self._start, self._stop, self._frame = np.zeros((4, n_worlds), dtype=np.int64)
         self.placed = torch.zeros(n_worlds, humanoid.mj_model.nu, dtype=torch.float64)
         self._unrewarded: list[_Unrewarded] | None = None
         self._earnings: list[Tensor] = []
@@ -175,7 +185,7 @@ class EgoPoseEnv(EnvBase):
     @property
     def frame(self) -> Tensor:
         """``[N]`` global frame each world is at."""
-        return self._frame.clone()
+        return torch.from_numpy(self._frame.copy())
 
     def body_state(self) -> TensorDict:
         """The present body state of all worlds, float64, batch ``[N]``."""
@@ -207,10 +217,11 @@ class EgoPoseEnv(EnvBase):
     def _begin(self, worlds: Tensor, *state: Tensor) -> None:
         episodes = self.starts(worlds, self._generator)
         # New counters, not new values in the old ones: those are in the observations given out.
-        self._take = self._take.index_copy(0, worlds, episodes.take)
-        self._start = self._start.index_copy(0, worlds, episodes.start)
-        self._stop = self._stop.index_copy(0, worlds, episodes.stop)
-        self._frame = self._frame.index_copy(0, worlds, episodes.start)
+        rows = worlds.numpy()
+        self._take = _replaced(self._take, rows, episodes.take.numpy())
+        self._start = _replaced(self._start, rows, episodes.start.numpy())
+        self._stop = _replaced(self._stop, rows, episodes.stop.numpy())
+        self._frame = _replaced(self._frame, rows, episodes.start.numpy())
         if state:
             self.place(worlds, *state)
         else:
@@ -242,7 +253,7 @@ class EgoPoseEnv(EnvBase):
         qpos, qvel = self.physics.qpos[rows], self.physics.qvel[rows]
         z = self.problem.observation({"qpos": torch.from_numpy(qpos), "qvel": torch.from_numpy(qvel)}).float()
         return {
-            **self._clock(worlds),
+            **self._clock(rows),
             "humanoid_state": z,
             **self._terms(torch.zeros(len(z), len(self.problem.reward.names))),
             **_no_flags(z.shape[:1]),
@@ -260,9 +271,10 @@ class EgoPoseEnv(EnvBase):
         terms = dict(zip(self.problem.reward.names, columns.split(1, dim=-1), strict=True))
         return {"reward_terms": TensorDict(terms, batch_size=columns.shape[:1])}
 
-    def _clock(self, worlds: Tensor | slice = ALL) -> dict[str, Tensor]:
-        frame, start, stop = (counter[worlds].unsqueeze(-1) for counter in (self._frame, self._start, self._stop))
-        return {"frame": frame, "episode_start": start, "episode_stop": stop, "episode_step": frame - start}
+    def _clock(self, worlds: NDArray[np.integer] | slice = ALL) -> dict[str, Tensor]:
+        frame, start, stop = self._frame[worlds, None], self._start[worlds, None], self._stop[worlds, None]
+        clock = {"frame": frame, "episode_start": start, "episode_stop": stop, "episode_step": frame - start}
+        return {name: torch.from_numpy(counter) for name, counter in clock.items()}
 
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
         stopped = self.physics.step(self._target(tensordict["action"], ALL), self._wrench(ALL))
@@ -282,18 +294,17 @@ class EgoPoseEnv(EnvBase):
 
     def _target(self, action: Tensor, worlds: slice) -> Array:
         # A world past its fragment's end (evaluation steps on until the last world is done) stays on its last frame.
-        frame = torch.minimum(self._frame[worlds] + 1, self._stop[worlds] - 1)
+        frame = np.minimum(self._frame[worlds] + 1, self._stop[worlds] - 1)
         # A new counter, not new values in the old one: that is in the observations given out.
-        self._frame = self._frame.clone()
-        self._frame[worlds] = frame
-        return self.problem.target(action.detach(), frame, self.placed[worlds]).numpy()
+        self._frame = _replaced(self._frame, worlds, frame)
+        return self.problem.target(action, torch.from_numpy(frame), self.placed[worlds]).numpy()
 
     def _wrench(self, worlds: slice) -> Array | None:
         """On the roots of ``worlds``, towards the frames that :meth:`_target` has set; None without assistance."""
         if self._assistance is None:
             return None
         now = {k: torch.from_numpy(v[worlds]) for k, v in (("qpos", self.physics.qpos), ("qvel", self.physics.qvel))}
-        return self._assistance.wrench(now, self._frame[worlds], self._taken(worlds)).numpy()
+        return self._assistance.wrench(now, torch.from_numpy(self._frame[worlds]), self._taken(worlds)).numpy()
 
     def _taken(self, worlds: slice) -> Tensor:
         """``[n]`` control steps that all worlds of the run have taken, when all have as many as each of these."""
@@ -305,17 +316,20 @@ class EgoPoseEnv(EnvBase):
         return ramp(self._falls.head_drop, self.problem.termination.head_drop, self._falls.steps, self._taken(worlds))
 
     def _arrived(self, stopped: NDArray[np.bool_], worlds: slice) -> dict[str, Any]:
-        diverged = torch.from_numpy(stopped)
         body = {k: torch.from_numpy(v) for k, v in self.physics.body_state(worlds).items()}
         state = self.problem.view(body)
-        fallen = self.problem.fallen(state, self._take[worlds], self._head_drop(worlds))
-        terminated = diverged | fallen if self.problem.termination.enabled else diverged
-        frame = self._frame[worlds]
-        truncated = (frame >= self._stop[worlds] - 1) & ~terminated
+        take = torch.from_numpy(self._take[worlds])
+        fallen = self.problem.fallen(state, take, self._head_drop(worlds)).numpy()
+        terminated = stopped | fallen if self.problem.termination.enabled else stopped
+        truncated = (self._frame[worlds] >= self._stop[worlds] - 1) & ~terminated
+        done = terminated | truncated
         clock = self._clock(worlds)
-        steps = clock["episode_step"].squeeze(-1)
-        if isinstance(self.starts, AdaptiveStarts) and bool((ended := terminated | truncated).any()):
-            self.starts.ended(self._start[worlds][ended], steps[ended], terminated[ended])
+        frame, steps = clock["frame"].squeeze(-1), clock["episode_step"].squeeze(-1)
+        if isinstance(self.starts, AdaptiveStarts) and done.any():
+            ended = torch.from_numpy(done)
+            start = torch.from_numpy(self._start[worlds])
+            self.starts.ended(start[ended], steps[ended], torch.from_numpy(terminated)[ended])
+        diverged = torch.from_numpy(stopped)
         if self._unrewarded is None:
             earned = self._earned(state, frame, steps, diverged)
             reward, terms = earned[:, :1], self._terms(earned[:, 1:])
@@ -325,16 +339,13 @@ class EgoPoseEnv(EnvBase):
             if len(self._unrewarded) * len(stopped) >= _STEPS_REWARDED_AT_ONCE * self.batch_size[0]:
                 self._reward_waiting()
             reward, terms = self._unknown_reward[worlds], {}
+        flags = {"fallen": fallen, "diverged": stopped, "terminated": terminated, "truncated": truncated, "done": done}
         return {
             **clock,
             "humanoid_state": self.problem.observation(state).float(),
             "reward": reward,
             **terms,
-            "fallen": fallen.unsqueeze(-1),
-            "diverged": diverged.unsqueeze(-1),
-            "terminated": terminated.unsqueeze(-1),
-            "truncated": truncated.unsqueeze(-1),
-            "done": (terminated | truncated).unsqueeze(-1),
+            **{name: torch.from_numpy(flag[:, None]) for name, flag in flags.items()},
         }
 
     def state_dict(self, *args: Any, **kwargs: Any) -> dict[str, Tensor]:
@@ -342,10 +353,10 @@ class EgoPoseEnv(EnvBase):
         physics = {f"physics.{k}": torch.from_numpy(v) for k, v in self.physics.state_dict().items()}
         return physics | {
             "generator": self._generator.get_state(),
-            "take": self._take.clone(),
-            "start": self._start.clone(),
-            "stop": self._stop.clone(),
-            "frame": self._frame.clone(),
+            "take": torch.from_numpy(self._take.copy()),
+            "start": torch.from_numpy(self._start.copy()),
+            "stop": torch.from_numpy(self._stop.copy()),
+            "frame": torch.from_numpy(self._frame.copy()),
             **({"placed": self.placed.clone()} if self.problem.action.reference == "start" else {}),
             **({"survived": self.starts.survived.clone()} if isinstance(self.starts, AdaptiveStarts) else {}),
         }
@@ -359,7 +370,7 @@ class EgoPoseEnv(EnvBase):
         self.physics.load_state_dict({k: state_dict[f"physics.{k}"].numpy() for k in ("state", "counters")})
         self._generator.set_state(state_dict["generator"])
         self._take, self._start, self._stop, self._frame = (
-            state_dict[k].clone() for k in ("take", "start", "stop", "frame")
+            state_dict[k].numpy().copy() for k in ("take", "start", "stop", "frame")
         )
         if self.problem.action.reference == "start":
             self.placed = state_dict["placed"].clone()

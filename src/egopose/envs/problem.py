@@ -6,13 +6,14 @@ from dataclasses import dataclass
 from types import SimpleNamespace
 from typing import TYPE_CHECKING
 
+import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from egopose.envs.futures import Futures
 from egopose.envs.mdp import terminations
-from egopose.envs.mdp.observations import BodyLayout, BodyState, BodyView
+from egopose.envs.mdp.observations import BodyLayout, BodyState, BodyView, humanoid_state_rows
 from egopose.envs.mdp.rewards import Reward
 from egopose.humanoid.torques import torque_driven
 
@@ -142,6 +143,7 @@ class ImitationProblem:
         self._qpos, self._qvel = whole.qpos, whole.qvel
         self._rewarded = {name: getattr(whole, name).contiguous() for name in reward.reads}
         self._range = torch.as_tensor(humanoid.joint_range, dtype=torch.float64).T
+        self._bounds = self._range[0].numpy().copy(), self._range[1].numpy().copy()
         self._rest = torch.as_tensor(humanoid.rest_action, dtype=torch.float64)
         self._table: Tensor | None = None
         if action.reference == "regressor":
@@ -201,11 +203,17 @@ class ImitationProblem:
             base = placed
         else:
             base = self._rest if self._table is None else self._table.index_select(0, frame)
-        return torch.clamp(base + self.action.scale * action.to(torch.float64), self._range[0], self._range[1])
+        # As arrays: for the few rows of a step an operator of torch costs several times what it works out.
+        target = action.detach().numpy().astype(np.float64)
+        target *= self.action.scale
+        target += base.numpy()
+        low, high = self._bounds
+        return torch.from_numpy(np.minimum(np.maximum(target, low, out=target), high, out=target))
 
     def observation(self, state: BodyState | BodyView) -> Tensor:
         """The humanoid state ``[N, 115]``, float64."""
-        return self.view(state).humanoid_state
+        body = self.view(state)
+        return torch.from_numpy(humanoid_state_rows(body.qpos.numpy(), body.qvel.numpy()))
 
     def rewards(self, state: BodyState | BodyView, frame: Tensor, step: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
         """Reward ``[N]`` and its terms for states at global frames ``[N]``, ``step [N]`` steps into the episode."""

@@ -89,13 +89,15 @@ class UniformStarts:
         self._take, self._start, self._stop = _bounds(fragments, offsets, lengths)
         self._choices = (self._stop - self._start - minimum + 1).clamp_min(1)
         self._ends = self._choices.cumsum(0)
+        self._shift = self._start - (self._ends - self._choices)
         self.horizon = horizon
 
     def __call__(self, worlds: Tensor, generator: torch.Generator) -> Episodes:
         pick = torch.randint(int(self._ends[-1]), worlds.shape, generator=generator)
         fragment = torch.searchsorted(self._ends, pick, right=True)
-        start = self._start[fragment] + pick - (self._ends[fragment] - self._choices[fragment])
-        return Episodes(self._take[fragment], start, torch.minimum(start + self.horizon, self._stop[fragment]))
+        start = pick + self._shift.index_select(0, fragment)
+        stop = torch.minimum(start + self.horizon, self._stop.index_select(0, fragment))
+        return Episodes(self._take.index_select(0, fragment), start, stop)
 
 
 class AdaptiveStarts(UniformStarts):

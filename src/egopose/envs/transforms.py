@@ -1,12 +1,22 @@
-"""TorchRL transforms of the environment: the visual context of a frame, and the running normaliser of the state."""
+"""TorchRL transforms of the environment: the visual context of a frame, and the running normaliser of the state.
+
+They reckon on arrays: for the few rows of a step an operator of torch costs several times what it works out.
+"""
 
 from __future__ import annotations
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.data import Composite, TensorSpec, Unbounded
 from torchrl.envs.transforms import Transform
+
+
+def _clip(values: NDArray[np.floating], bound: float) -> NDArray[np.floating]:
+    """``values`` brought within the bound in place; NaN stays."""
+    return np.minimum(np.maximum(values, -bound, out=values), bound, out=values)
 
 
 class VisualContext(Transform):
@@ -26,7 +36,7 @@ class VisualContext(Transform):
         self.table = table
 
     def _apply_transform(self, obs: Tensor) -> Tensor:
-        return self.table[obs.squeeze(-1)]
+        return self.table.index_select(0, obs.flatten()).unflatten(0, obs.shape[:-1])
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         return next_tensordict.set(self.out_keys[0], self._apply_transform(next_tensordict[self.in_keys[0]]))
@@ -71,8 +81,12 @@ class TrackingError(Transform):
         frame = tensordict["frame"].squeeze(-1)
         now = self.table.index_select(0, frame)
         ahead = self.table.index_select(0, self.following.index_select(0, frame))
-        error = torch.stack([tensordict["humanoid_state"], ahead], dim=-2).sub_(now.unsqueeze(-2)).div_(self.scale)
-        return tensordict.set(self.out_keys[0], error.clamp_(-self.clip, self.clip).flatten(-2))
+        error = np.empty((*now.shape[:-1], 2, now.shape[-1]), dtype=np.float32)
+        np.subtract(tensordict["humanoid_state"].numpy(), now.numpy(), out=error[..., 0, :])
+        np.subtract(ahead.numpy(), now.numpy(), out=error[..., 1, :])
+        error /= self.scale.numpy()
+        _clip(error, self.clip)
+        return tensordict.set(self.out_keys[0], torch.from_numpy(error.reshape(*now.shape[:-1], -1)))
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         return self.forward(next_tensordict)
@@ -137,8 +151,11 @@ class StateNormalizer(Transform):
     @property
     def std(self) -> Tensor:
         """``[D]`` sample deviation; ones before two observations were seen."""
-        count = int(self.count)
-        return (self.sum_of_squares / (count - 1)).sqrt() if count > 1 else torch.ones_like(self.mean)
+        return torch.from_numpy(self._deviation())
+
+    def _deviation(self) -> NDArray[np.float64]:
+        count, squares = int(self.count), self.sum_of_squares.numpy()
+        return np.sqrt(squares / (count - 1)) if count > 1 else np.ones_like(squares)
 
     def freeze(self, frozen: bool = True) -> StateNormalizer:
         """Stop (or take up again) the updates; normalising goes on."""
@@ -150,21 +167,23 @@ class StateNormalizer(Transform):
         n = values.shape[0]
         if n == 0:
             return
-        values = values.to(torch.float64)
-        mean = values.mean(0)
-        # Python numbers: dividing integer tensors would round the weights to float32.
+        rows, mean, squares = values.numpy().astype(np.float64), self.mean.numpy(), self.sum_of_squares.numpy()
+        theirs = np.add.reduce(rows) / n
         before = int(self.count)
         total = before + n
-        delta = mean - self.mean
-        self.sum_of_squares.add_((values - mean).square_().sum(0)).addcmul_(delta, delta, value=before * n / total)
-        self.mean.add_(delta, alpha=n / total)
+        delta = theirs - mean
+        rows -= theirs
+        rows *= rows
+        squares += np.add.reduce(rows) + delta * delta * (before * n / total)
+        mean += delta * (n / total)
         self.count.add_(n)
 
     def normalize(self, values: Tensor) -> Tensor:
         """``values [..., D]`` by the present statistics, in their own dtype."""
         # The floor keeps a constant feature's rounding noise from being blown up.
-        scaled = (values.to(torch.float64) - self.mean).div_(self.std.add_(1e-8))
-        return scaled.clamp_(-self.clip, self.clip).to(values.dtype)
+        scaled = values.numpy() - self.mean.numpy()
+        scaled /= self._deviation() + 1e-8
+        return torch.from_numpy(_clip(scaled, self.clip)).to(values.dtype)
 
     def _apply_transform(self, obs: Tensor) -> Tensor:
         return self.normalize(obs)

@@ -48,6 +48,7 @@ class BalanceFeedback(nn.Module):
 
     columns: Tensor
     basis: Tensor
+    spread: Tensor  # the basis, a row for each of a group's gains
 
     def __init__(self, settings: FeedbackSettings, dof_names: Sequence[str]) -> None:
         super().__init__()
@@ -69,11 +70,12 @@ class BalanceFeedback(nn.Module):
         columns = [[q, angular + w, linear + v] for q, w, v in (_PLANES[plane] for plane in owners)]
         self.register_buffer("basis", torch.stack(basis))
         self.register_buffer("columns", torch.tensor(columns))
+        self.register_buffer("spread", torch.stack(basis).repeat_interleave(3, 0), persistent=False)
         self.speed = settings.speed
         #: ``[groups, 3]``: gains on lean, rate and speed, in units of ``speed``; zero at the start.
         self.gains = nn.Parameter(torch.zeros(len(basis), 3))
 
     def forward(self, tracking_error: Tensor) -> Tensor:
         """See the class."""
-        seen = tracking_error[..., self.columns]
-        return (seen * (self.speed * self.gains)).sum(dim=-1) @ self.basis
+        seen = tracking_error.index_select(-1, self.columns.flatten())
+        return (seen * (self.speed * self.gains).flatten()) @ self.spread

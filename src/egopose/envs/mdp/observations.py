@@ -7,12 +7,15 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import TypeAlias
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from tensordict import TensorDictBase
 from torch import Tensor
 
 from egopose.envs.mdp import rotations as rot
 
+Array = NDArray[np.float64]
 BodyState: TypeAlias = TensorDictBase | Mapping[str, Tensor]
 
 
@@ -127,6 +130,27 @@ class BodyView:
             ],
             dim=-1,
         )
+
+
+def humanoid_state_rows(qpos: Array, qvel: Array) -> Array:
+    """:func:`humanoid_state` of ``qpos [N, nq]`` and ``qvel [N, nv]`` as arrays, at a fifth of the time for few rows.
+
+    With the heading's cosine and sine (c, s) = (w, z) / |(w, z)| of half its angle, the de-headed root quaternion is
+    (|(w, z)|, c x + s y, c y - s x, 0). Rows round alike however many there are.
+    """
+    nq = qpos.shape[1]
+    w, x, y, z = qpos[:, 3:7].T
+    w = w + 1e-16  # as in rotations.heading: below rounding, unless (w, z) vanishes
+    size = np.sqrt(w * w + z * z)
+    c, s = w / size, z / size
+    cos, sin = c * c - s * s, 2.0 * c * s
+    along, across = qvel[:, 0], qvel[:, 1]
+    out = np.empty((len(qpos), 2 * nq - 3))
+    out[:, 0], out[:, 1], out[:, 2], out[:, 3], out[:, 4] = qpos[:, 2], size, c * x + s * y, c * y - s * x, 0.0
+    out[:, 5 : nq - 2] = qpos[:, 7:]
+    out[:, nq - 2], out[:, nq - 1] = cos * along + sin * across, cos * across - sin * along
+    out[:, nq:] = qvel[:, 2:]
+    return out
 
 
 def humanoid_state(state: BodyState) -> Tensor:
