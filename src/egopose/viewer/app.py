@@ -198,7 +198,7 @@ class Viewer:
             lines = {n: (c.curves[name], _css(color)) for n, c, color in clips if name in c.curves}
             resets = clips[0][1].curves.get("reset")
             if name == "confidence" and resets is not None and resets.any():
-                lines["resets"] = (resets, "#d33")
+                lines["resets" if len(clips) == 1 else f"resets of {clips[0][0]}"] = (resets, "#d33")
             chart.set(lines, fps)
         curves = clips[0][1].curves
         figures = [n for n in curves if n not in ("value", "confidence", "reset") and np.isfinite(curves[n]).any()]
