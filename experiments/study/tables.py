@@ -217,32 +217,38 @@ def estimation_table(found: Mapping[tuple[str, str], Scores], measured: Mapping[
         lines += [
             f"## {title}",
             "",
-            *_header(["method", *(METRICS[h] for h in heads), "resets a minute", "whole takes"]),
+            *_header(["method", *(METRICS[h] for h in heads), "resets a minute", "whole takes", "seeds", "takes"]),
         ]
         for method in methods:
             scores = found[protocol, method]
             folds = list(scores.results)
             seeds = scores.seeds(folds)
             cells = [_cell(_interval(scores, METRICS[h], folds, seeds)) for h in heads]
-            lines.append(_row([LABELS[method], *cells, *_resets(scores, folds, seeds)]))
+            takes = sum(len(names) for names in scores.takes(folds))
+            lines.append(_row([LABELS[method], *cells, *_resets(scores, folds, seeds), str(len(seeds)), str(takes)]))
         lines += ["", *_ratio_rows([f"{protocol}/{h}" for h in heads], measured), ""]
     return lines
 
 
 def ablation_table(found: Mapping[tuple[str, str], Scores]) -> list[str]:
-    """Table 2, as Markdown."""
+    """Table 2, as Markdown: on the folds and seeds that all its rows have, or its order would be that of the takes."""
     lines = _header(["", "resets", "E_pose", "E_vel", "A_accl", "paper: resets", "E_pose", "E_vel", "A_accl"])
-    for method, paper in PAPER_ABLATIONS.items():
-        scores = found.get(("cross", method))
-        if scores is None:
-            continue
-        folds = list(scores.results)
-        seeds = scores.seeds(folds)
+    rows = {method: found["cross", method] for method in PAPER_ABLATIONS if ("cross", method) in found}
+    if not rows:
+        return lines
+    folds = sorted(set.intersection(*(set(scores.results) for scores in rows.values())))
+    seeds = sorted(set.intersection(*(set(scores.seeds(folds)) for scores in rows.values()))) if folds else []
+    if not seeds:
+        return lines
+    for method, scores in rows.items():
+        paper = PAPER_ABLATIONS[method]
         resets = np.mean([sum(sum(scores.results[f][s]["resets"]) for f in folds) for s in seeds])
         cells = [_cell(_interval(scores, key, folds, seeds)) for key in ("E_pose", "E_vel", "A_accl")]
         label = "(a) full" if method == "ours" else LABELS[method]
         lines.append(_row([label, f"{resets:g}", *cells, *(f"{v:g}" for v in paper)]))
-    return lines
+    takes = sum(len(names) for names in next(iter(rows.values())).takes(folds))
+    told = f"Left out: {', '.join(fold.removeprefix('without') for fold in folds)}; {takes} takes, {len(seeds)} seed"
+    return [*lines, "", f"{told}{'s' if len(seeds) > 1 else ''} of every row. Resets: a whole pass over them."]
 
 
 def horizon_table(found: Mapping[tuple[str, str], Scores], measured: Mapping[str, Mapping[str, Any]]) -> list[str]:
