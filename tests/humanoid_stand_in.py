@@ -44,6 +44,7 @@ class StandIn:
     rest_action: np.ndarray
     end_effectors: np.ndarray
     head: int
+    feet: np.ndarray
     substeps: int
     control_dt: float
 
@@ -103,6 +104,7 @@ def stand_in(substeps: int = 5) -> StandIn:
         rest_action=np.zeros(model.nu),
         end_effectors=np.array([order.index(n) for n in ("RightHand", "LeftHand", "RightFoot", "LeftFoot", "Head")]),
         head=order.index("Head"),
+        feet=np.array([order.index(n) for n in ("RightFoot", "LeftFoot")]),
         substeps=substeps,
         control_dt=1 / 30,
     )

@@ -17,6 +17,7 @@ from egopose.errors import InputError
 from egopose.humanoid.config import HumanoidConfig, SimConfig
 from egopose.humanoid.from_motion import config_from_motion, humanoid_from_motion
 from egopose.humanoid.model import build_humanoid, sole_points
+from egopose.humanoid.soles import out_of_floor
 from egopose.motion import rotations as rot
 from egopose.motion.io import read_motion
 from egopose.motion.kinematics import forward_kinematics
@@ -148,6 +149,30 @@ def test_the_sole_under_the_box_is_where_it_says() -> None:
         assert corner[0] - model.geom_size[geom, 0] == pytest.approx(points[0, 0])
         assert corner[0] + model.geom_size[geom, 0] == pytest.approx(points[1, 0])
     assert sole_points(default_config(), "LeftFoot") == pytest.approx(humanoid.sole_points[1])
+
+
+def test_out_of_the_floor_no_foot_touches_deeper_than_the_surface() -> None:
+    """By MuJoCo's own contacts; what stood clear stays where it was, and nothing but the height changes."""
+    humanoid = default_humanoid()
+    model, data = humanoid.mj_model, mujoco.MjData(humanoid.mj_model)
+    qpos = random_qpos(40)
+    qpos[:, 2] = np.random.default_rng(1).uniform(0.3, 1.5, size=40)
+    raised = out_of_floor(humanoid, qpos)
+    np.testing.assert_array_equal(np.delete(raised, 2, axis=1), np.delete(qpos, 2, axis=1))
+    feet, depths = {int(humanoid.body_ids[foot]) for foot in humanoid.feet}, []
+    for before, after in zip(qpos, raised, strict=True):
+        deepest = []
+        for pose in (before, after):
+            data.qpos[:] = pose
+            mujoco.mj_forward(model, data)
+            touching = [
+                c.dist for c in data.contact if {int(model.geom_bodyid[g]) for g in c.geom} & feet and 0 in c.geom
+            ]
+            deepest.append(min(touching, default=0.0))
+        assert deepest[1] > -1e-6
+        assert (after[2] > before[2]) == (deepest[0] < -1e-6)
+        depths.append(deepest[0])
+    assert sum(depth < -0.01 for depth in depths) > 5
 
 
 def test_it_stands_still_in_the_rest_pose() -> None:

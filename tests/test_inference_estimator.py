@@ -12,8 +12,10 @@ from torchrl.envs import Compose, TransformedEnv
 from egopose.envs.mdp.observations import humanoid_state
 from egopose.envs.transforms import StateNormalizer
 from egopose.evaluation.survival import action_towards, base_tracking, frames_survived, reference_tracking
+from egopose.humanoid.soles import out_of_floor, sole_edges
 from egopose.inference.estimator import Estimate, estimate_takes
 from egopose.inference.failsafe import FailSafe, FailSafeSettings
+from egopose.motion.motion import Motion
 
 NEVER_FALL = {"termination": {"enabled": False, "head_drop": 0.1}}
 
@@ -62,8 +64,18 @@ def test_the_first_state_is_the_regressors_at_the_references_place() -> None:
     for row, estimate in enumerate(estimates):
         start = estimate.qpos[0]
         np.testing.assert_allclose(start[:2], reference[row, :2], atol=1e-12)
-        assert start[2] == pytest.approx(float(states[estimate.start, 0]), abs=1e-6)
+        regressed = np.concatenate([start[:2], states[estimate.start, :1].numpy(), start[3:]])
+        assert start[2] == pytest.approx(out_of_floor(env.base_env.problem.humanoid, regressed[None])[0, 2], abs=1e-6)
         assert start[2] != pytest.approx(reference[row, 2], abs=1e-3)
+
+
+def test_a_state_that_is_regressed_into_the_floor_is_raised() -> None:
+    env = make_env(**NEVER_FALL)
+    estimates, _ = run(env, base_tracking(env), critic_of(steady), offset=-0.05)
+    humanoid = env.base_env.problem.humanoid
+    for estimate in estimates:
+        corners = sole_edges(humanoid, Motion(humanoid.skeleton, estimate.qpos[:1], 30.0))
+        assert corners[..., 2].min() == pytest.approx(0.0, abs=1e-9)
 
 
 def test_a_trigger_restarts_from_the_next_frames_regressed_state_where_the_body_was() -> None:

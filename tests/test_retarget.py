@@ -12,8 +12,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from mocap import RIGS, default_humanoid, rig_motion
 
-from egopose.data.prepare_motion import low_pass, reference_motion, sole_names, sole_positions, without_lead_in
+from egopose.data.prepare_motion import low_pass, reference_motion, without_lead_in
 from egopose.errors import InputError
+from egopose.humanoid.soles import sole_names, sole_positions
 from egopose.motion import rotations as rot
 from egopose.motion.inverse_kinematics import Targets, solve
 from egopose.motion.io import read_motion

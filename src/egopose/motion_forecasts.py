@@ -24,6 +24,7 @@ from egopose.envs.futures import Futures
 from egopose.envs.mdp.observations import humanoid_state
 from egopose.errors import InputError
 from egopose.evaluation.forecasting import ForecastWindow
+from egopose.humanoid.soles import out_of_floor
 from egopose.inference.forecaster import placed_states
 from egopose.material import Material
 from egopose.models.motion_forecast import MotionForecaster, spline_basis
@@ -68,7 +69,8 @@ def with_futures(config: Mapping[str, Any], material: Material, run: Path) -> Ma
 
 
 def begin_forecasts(agent: Agent, windows: Sequence[ForecastWindow], pasts: Tensor) -> tuple[Tensor, Tensor]:
-    """Where forecasts of ``windows`` begin: ``qpos [W, nq]`` and ``qvel [W, nv]``, placed where the reference is.
+    """Where forecasts of ``windows`` begin: ``qpos [W, nq]`` and ``qvel [W, nv]``, placed where the reference is, feet
+    out of the floor.
 
     That is the last state of ``pasts [W, context, S]``; where the agent follows kinematic forecasts, it is where those
     begin, and from now on the agent follows, from these frames, the ones that have seen ``pasts`` alone.
@@ -76,12 +78,13 @@ def begin_forecasts(agent: Agent, windows: Sequence[ForecastWindow], pasts: Tens
     material = agent.material
     now = torch.tensor([int(material.takes.offsets[w.take]) + w.now for w in windows])
     where = torch.as_tensor(material.reference["qpos"][now]).double()
-    limits = material.humanoid.joint_range
+    humanoid = material.humanoid
     if material.futures is None:
-        return placed_states(pasts[:, -1].numpy(), where.numpy(), limits)
+        return placed_states(pasts[:, -1].numpy(), where.numpy(), humanoid)
     curves = ForecastCurves(agent.config, material, agent.path.resolve().parent.parent)
     material.futures.put(curves(pasts), now)
-    return material.futures.first_state(now, where, limits)
+    qpos, qvel = material.futures.first_state(now, where, humanoid.joint_range)
+    return torch.from_numpy(out_of_floor(humanoid, qpos.numpy())), qvel
 
 
 def still_futures(config: Mapping[str, Any], material: Material) -> Material:

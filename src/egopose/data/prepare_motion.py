@@ -11,11 +11,11 @@ from scipy.signal import butter, sosfiltfilt
 
 from egopose.data.reference import reference_states
 from egopose.humanoid.model import HumanoidModel
+from egopose.humanoid.soles import sole_edges, sole_names, sole_positions
 from egopose.motion import rotations as rot
 from egopose.motion.motion import Motion
 from egopose.motion.plant import plant_feet
 from egopose.motion.retarget import RetargetReport, retarget
-from egopose.motion.rotations import Array
 from egopose.motion.settle import SettleSettings, settle
 
 
@@ -63,35 +63,6 @@ def low_pass(motion: Motion, cutoff_hz: float) -> Motion:
     qpos = sosfiltfilt(sections, qpos, axis=0, padtype="odd", padlen=min(12, len(qpos) - 1))
     qpos[:, 3:7] = rot.normalize(qpos[:, 3:7])
     return replace(motion, qpos=qpos)
-
-
-def sole_positions(humanoid: HumanoidModel, motion: Motion) -> Array:
-    """``[T, feet * 2, 3]`` world positions (m) of every foot's heel and ball, in this order."""
-    positions, quats = motion.forward_kinematics()
-    points = [
-        positions[:, foot] + rot.rotate(quats[:, foot], point[None])
-        for foot, sole in zip(humanoid.feet, humanoid.sole_points, strict=True)
-        for point in sole
-    ]
-    return np.stack(points, axis=1)
-
-
-def sole_edges(humanoid: HumanoidModel, motion: Motion) -> Array:
-    """``[T, feet * 4, 3]`` world positions (m) of the corners of every foot's sole."""
-    positions, quats = motion.forward_kinematics()
-    points = []
-    for foot in humanoid.feet:
-        geom = int(humanoid.mj_model.body_geomadr[humanoid.body_ids[foot]])
-        centre, half = humanoid.mj_model.geom_pos[geom], humanoid.mj_model.geom_size[geom]
-        for x, y in ((-1, -1), (-1, 1), (1, -1), (1, 1)):
-            corner = centre + half * [x, y, -1]
-            points.append(positions[:, foot] + rot.rotate(quats[:, foot], corner[None]))
-    return np.stack(points, axis=1)
-
-
-def sole_names(humanoid: HumanoidModel) -> tuple[str, ...]:
-    """Names of the points of :func:`sole_positions`."""
-    return tuple(f"{humanoid.skeleton.names[f]}_{end}" for f in humanoid.feet for end in ("heel", "ball"))
 
 
 def reference_motion(

@@ -16,11 +16,11 @@ from typing import Any
 
 import numpy as np
 
-from egopose.data.prepare_motion import sole_positions
 from egopose.evaluation import metrics, position_metrics
 from egopose.evaluation.keypoints import motion_keypoints, side_view_error
 from egopose.evaluation.statistics import Interval, mean_interval, ratio_interval
 from egopose.humanoid.model import HumanoidModel
+from egopose.humanoid.soles import sole_positions
 from egopose.motion.contacts import contact_labels
 from egopose.motion.motion import Motion
 from egopose.motion.rotations import Array

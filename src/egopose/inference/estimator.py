@@ -21,6 +21,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from egopose.envs.env import EgoPoseEnv
 from egopose.envs.transforms import StateNormalizer
 from egopose.humanoid.model import HumanoidModel
+from egopose.humanoid.soles import out_of_floor
 from egopose.inference.failsafe import FailSafe
 from egopose.inference.forks import Forks
 from egopose.models.episode_context import EpisodeContext
@@ -180,7 +181,8 @@ def prepare_for_test(env: TransformedEnv, *controllers: Controller, lookahead: i
 
 
 def _restart(base: EgoPoseEnv, worlds: Tensor, states: Tensor, qpos: Tensor) -> None:
-    """Put ``worlds [n]`` into the regressor's ``states [n, ...]`` at the place and heading of ``qpos [n, nq]``."""
-    where = qpos.numpy()
-    placed = state_to_qpos(states.numpy(), where[:, :2], rot.heading(where[:, 3:7]), base.problem.humanoid.joint_range)
-    base.place(worlds, *(torch.from_numpy(part) for part in placed))
+    """Put ``worlds [n]`` into the regressor's ``states [n, ...]`` at the place and heading of ``qpos [n, nq]``, feet
+    out of the floor."""
+    where, humanoid = qpos.numpy(), base.problem.humanoid
+    placed, velocity = state_to_qpos(states.numpy(), where[:, :2], rot.heading(where[:, 3:7]), humanoid.joint_range)
+    base.place(worlds, torch.from_numpy(out_of_floor(humanoid, placed)), torch.from_numpy(velocity))

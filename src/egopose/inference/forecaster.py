@@ -17,6 +17,8 @@ from torchrl.envs import TransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from egopose.envs.env import EgoPoseEnv
+from egopose.humanoid.model import HumanoidModel
+from egopose.humanoid.soles import out_of_floor
 from egopose.inference.estimator import Controller, prepare_for_test
 from egopose.models.pose_regression import state_to_qpos
 from egopose.motion import rotations as rot
@@ -104,7 +106,8 @@ def forecast(
     )
 
 
-def placed_states(states: Array, reference: Array, joint_range: Array) -> tuple[Tensor, Tensor]:
-    """States z ``[W, S]`` as qpos ``[W, nq]`` and qvel ``[W, nv]``, standing and facing as ``reference [W, nq]``."""
-    placed = state_to_qpos(states, reference[:, :2], rot.heading(reference[:, 3:7]), joint_range)
-    return torch.from_numpy(placed[0]), torch.from_numpy(placed[1])
+def placed_states(states: Array, reference: Array, humanoid: HumanoidModel) -> tuple[Tensor, Tensor]:
+    """States z ``[W, S]`` as qpos ``[W, nq]`` and qvel ``[W, nv]``, standing and facing as ``reference [W, nq]``, feet
+    out of the floor."""
+    qpos, qvel = state_to_qpos(states, reference[:, :2], rot.heading(reference[:, 3:7]), humanoid.joint_range)
+    return torch.from_numpy(out_of_floor(humanoid, qpos)), torch.from_numpy(qvel)

@@ -20,6 +20,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from egopose.envs.env import EgoPoseEnv
 from egopose.envs.transforms import StateNormalizer, TrackingError
 from egopose.errors import InputError
+from egopose.humanoid.soles import out_of_floor
 from egopose.inference.causal import Seen
 from egopose.inference.estimator import prepare_for_test
 from egopose.inference.failsafe import FailSafe, FailSafeSettings
@@ -166,10 +167,10 @@ class LiveBody:
         return observation
 
     def _place(self, seen: Seen, where: Array) -> None:
-        """Into the regressor's state, standing and facing as ``where [1, nq]``."""
-        state = seen.humanoid_state[None].numpy()
-        placed = state_to_qpos(state, where[:, :2], rot.heading(where[:, 3:7]), self._problem.humanoid.joint_range)
-        self._base.place(self._world, *(torch.from_numpy(part) for part in placed))
+        """Into the regressor's state, standing and facing as ``where [1, nq]``, feet out of the floor."""
+        state, humanoid = seen.humanoid_state[None].numpy(), self._problem.humanoid
+        qpos, qvel = state_to_qpos(state, where[:, :2], rot.heading(where[:, 3:7]), humanoid.joint_range)
+        self._base.place(self._world, torch.from_numpy(out_of_floor(humanoid, qpos)), torch.from_numpy(qvel))
 
 
 def _make_live(network: TensorDictModuleBase) -> list[LiveContext]:

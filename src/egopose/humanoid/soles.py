@@ -1,0 +1,57 @@
+"""Where a humanoid's soles are, and a body placed so that they are not in the floor."""
+
+from __future__ import annotations
+
+from itertools import product
+
+import numpy as np
+
+from egopose.humanoid.model import HumanoidModel
+from egopose.motion import rotations as rot
+from egopose.motion.motion import Motion
+from egopose.motion.rotations import Array
+
+
+def sole_positions(humanoid: HumanoidModel, motion: Motion) -> Array:
+    """``[T, feet * 2, 3]`` world positions (m) of every foot's heel and ball, in this order."""
+    positions, quats = motion.forward_kinematics()
+    points = [
+        positions[:, foot] + rot.rotate(quats[:, foot], point[None])
+        for foot, sole in zip(humanoid.feet, humanoid.sole_points, strict=True)
+        for point in sole
+    ]
+    return np.stack(points, axis=1)
+
+
+def sole_edges(humanoid: HumanoidModel, motion: Motion) -> Array:
+    """``[T, feet * 4, 3]`` world positions (m) of the corners of every foot's sole."""
+    return _foot_corners(humanoid, motion, (-1,))
+
+
+def _foot_corners(humanoid: HumanoidModel, motion: Motion, sides: tuple[int, ...]) -> Array:
+    """``[T, feet * 4 * sides, 3]`` m: corners of every foot's box, of its underside (-1) and upper side (1)."""
+    positions, quats = motion.forward_kinematics()
+    points = []
+    for foot in humanoid.feet:
+        geom = int(humanoid.mj_model.body_geomadr[humanoid.body_ids[foot]])
+        centre, half = humanoid.mj_model.geom_pos[geom], humanoid.mj_model.geom_size[geom]
+        for x, y, z in product((-1, 1), (-1, 1), sides):
+            points.append(positions[:, foot] + rot.rotate(quats[:, foot], (centre + half * [x, y, z])[None]))
+    return np.stack(points, axis=1)
+
+
+def sole_names(humanoid: HumanoidModel) -> tuple[str, ...]:
+    """Names of the points of :func:`sole_positions`."""
+    return tuple(f"{humanoid.skeleton.names[f]}_{end}" for f in humanoid.feet for end in ("heel", "ball"))
+
+
+def out_of_floor(humanoid: HumanoidModel, qpos: Array) -> Array:
+    """``qpos [N, nq]`` raised, where it has to be, until no corner of a foot is under the floor (z = 0).
+
+    A state that was regressed has its root's height and its joints from different numbers, and stands up to 5 cm deep:
+    physics would throw the body out.
+    """
+    corners = _foot_corners(humanoid, Motion(humanoid.skeleton, qpos, 1.0 / humanoid.control_dt), (-1, 1))
+    out = qpos.copy()
+    out[:, 2] += np.maximum(0.0, -corners[..., 2].min(axis=1))
+    return out
