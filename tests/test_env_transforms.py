@@ -256,3 +256,11 @@ def test_stepping_and_resetting_at_once_is_torchrls_own_to_the_bit() -> None:
     assert resets > 5
     for name, statistic in mine.state_dict().items():
         torch.testing.assert_close(statistic, theirs.state_dict()[name], rtol=0, atol=0)
+
+
+def test_a_steps_rows_are_normalised_as_any_others() -> None:
+    """What the policy sees in an environment, worked out on arrays, is what it sees outside, to the bit."""
+    normalizer = StateNormalizer(5, clip=1.5)
+    for rows in torch.randn(4, 7, 5, generator=torch.Generator().manual_seed(3)):
+        inside = normalizer._step(TensorDict(), TensorDict(humanoid_state=rows.clone()))["humanoid_state"]
+        torch.testing.assert_close(inside, normalizer.normalize(rows), rtol=0, atol=0)

@@ -297,7 +297,7 @@ class EgoPoseEnv(EnvBase):
         frame = np.minimum(self._frame[worlds] + 1, self._stop[worlds] - 1)
         # A new counter, not new values in the old one: that is in the observations given out.
         self._frame = _replaced(self._frame, worlds, frame)
-        return self.problem.target(action, torch.from_numpy(frame), self.placed[worlds]).numpy()
+        return self.problem.target(action.detach(), torch.from_numpy(frame), self.placed[worlds]).numpy()
 
     def _wrench(self, worlds: slice) -> Array | None:
         """On the roots of ``worlds``, towards the frames that :meth:`_target` has set; None without assistance."""

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from types import SimpleNamespace
 from typing import TYPE_CHECKING
 
-import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
@@ -143,7 +142,6 @@ class ImitationProblem:
         self._qpos, self._qvel = whole.qpos, whole.qvel
         self._rewarded = {name: getattr(whole, name).contiguous() for name in reward.reads}
         self._range = torch.as_tensor(humanoid.joint_range, dtype=torch.float64).T
-        self._bounds = self._range[0].numpy().copy(), self._range[1].numpy().copy()
         self._rest = torch.as_tensor(humanoid.rest_action, dtype=torch.float64)
         self._table: Tensor | None = None
         if action.reference == "regressor":
@@ -203,15 +201,10 @@ class ImitationProblem:
             base = placed
         else:
             base = self._rest if self._table is None else self._table.index_select(0, frame)
-        # As arrays: for the few rows of a step an operator of torch costs several times what it works out.
-        target = action.detach().numpy().astype(np.float64)
-        target *= self.action.scale
-        target += base.numpy()
-        low, high = self._bounds
-        return torch.from_numpy(np.minimum(np.maximum(target, low, out=target), high, out=target))
+        return torch.clamp(base + self.action.scale * action.to(torch.float64), self._range[0], self._range[1])
 
     def observation(self, state: BodyState | BodyView) -> Tensor:
-        """The humanoid state ``[N, 115]``, float64."""
+        """The humanoid state ``[N, 115]``, float64; worked out on arrays (trace ``view(state).humanoid_state``)."""
         body = self.view(state)
         return torch.from_numpy(humanoid_state_rows(body.qpos.numpy(), body.qvel.numpy()))
 

@@ -1,6 +1,6 @@
 """TorchRL transforms of the environment: the visual context of a frame, and the running normaliser of the state.
 
-They reckon on arrays: for the few rows of a step an operator of torch costs several times what it works out.
+At a step they reckon on arrays: for its few rows an operator of torch costs several times what it works out.
 """
 
 from __future__ import annotations
@@ -151,11 +151,8 @@ class StateNormalizer(Transform):
     @property
     def std(self) -> Tensor:
         """``[D]`` sample deviation; ones before two observations were seen."""
-        return torch.from_numpy(self._deviation())
-
-    def _deviation(self) -> NDArray[np.float64]:
-        count, squares = int(self.count), self.sum_of_squares.numpy()
-        return np.sqrt(squares / (count - 1)) if count > 1 else np.ones_like(squares)
+        count = int(self.count)
+        return (self.sum_of_squares / (count - 1)).sqrt() if count > 1 else torch.ones_like(self.mean)
 
     def freeze(self, frozen: bool = True) -> StateNormalizer:
         """Stop (or take up again) the updates; normalising goes on."""
@@ -181,8 +178,14 @@ class StateNormalizer(Transform):
     def normalize(self, values: Tensor) -> Tensor:
         """``values [..., D]`` by the present statistics, in their own dtype."""
         # The floor keeps a constant feature's rounding noise from being blown up.
+        scaled = (values.to(torch.float64) - self.mean).div_(self.std.add_(1e-8))
+        return scaled.clamp_(-self.clip, self.clip).to(values.dtype)
+
+    def _normalize_rows(self, values: Tensor) -> Tensor:
+        """:meth:`normalize` to the bit, on arrays."""
+        count, squares = int(self.count), self.sum_of_squares.numpy()
         scaled = values.numpy() - self.mean.numpy()
-        scaled /= self._deviation() + 1e-8
+        scaled /= (np.sqrt(squares / (count - 1)) if count > 1 else 1.0) + 1e-8
         return torch.from_numpy(_clip(scaled, self.clip)).to(values.dtype)
 
     def _apply_transform(self, obs: Tensor) -> Tensor:
@@ -196,7 +199,7 @@ class StateNormalizer(Transform):
         values = next_tensordict[self.in_keys[0]]
         if not self.frozen:
             self.update(values.reshape(-1, values.shape[-1]))
-        return next_tensordict.set(self.out_keys[0], self.normalize(values))
+        return next_tensordict.set(self.out_keys[0], self._normalize_rows(values))
 
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
         values = tensordict_reset[self.in_keys[0]]
@@ -204,4 +207,4 @@ class StateNormalizer(Transform):
         if not self.frozen:
             fresh = values.reshape(-1, values.shape[-1])
             self.update(fresh if mask is None else fresh[mask.reshape(-1)])
-        return tensordict_reset.set(self.out_keys[0], self.normalize(values))
+        return tensordict_reset.set(self.out_keys[0], self._normalize_rows(values))

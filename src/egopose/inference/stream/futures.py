@@ -271,7 +271,8 @@ class _Step(nn.Module):
             hidden: the memory before.
             placed: ``[N, nu]`` rad, where the bodies were put.
         """
-        state = self._problem.observation({"qpos": qpos, "qvel": qvel}).float()
+        # Of operators that can be traced, where `observation` has arrays.
+        state = self._problem.view({"qpos": qpos, "qvel": qvel}).humanoid_state.float()
         inputs: tuple[Tensor, ...] = (context,)
         targets = torch.zeros(())
         if self.follow is not None:
