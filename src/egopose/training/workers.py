@@ -289,8 +289,10 @@ def _join_ray(cpus: int, address: str | None) -> Callable[[], None] | None:
         raise InputError("conf/collector", "kind", "ray needs Ray: pip install 'egopose[ray]'") from None
     there = ray.is_initialized()
     if not there:
-        # A cluster made here is told of as many cores as are wanted: threads share them, Ray only counts.
-        place: dict[str, Any] = {"num_cpus": cpus} if address is None else {"address": address}
+        # A cluster made here is told of as many cores as are wanted: threads share them, Ray only counts. Its workers
+        # are not to give way to all else on the machine, by 15 as Ray would have it: the training waits for them.
+        here: dict[str, Any] = {"num_cpus": cpus, "_system_config": {"worker_niceness": 0}}
+        place = here if address is None else {"address": address}
         # What runtime.prepare_runtime sets here, for processes that this one does not start.
         environment = {"env_vars": {"OMP_WAIT_POLICY": "PASSIVE", "GOMP_SPINCOUNT": "0"}}
         try:
