@@ -35,7 +35,7 @@ class Results:
         survival: frames survived per run, see :func:`egopose.evaluation.agents.survival_figures`.
         failsafe: of each run, see :func:`egopose.evaluation.agents.failsafe_figures`.
         videos: the side-by-side MP4s.
-        rendered: whether any take's wearer's video is rendered and not filmed.
+        notes: what is to be said of the wearer's videos, where any was rendered.
     """
 
     folder: Path
@@ -43,7 +43,7 @@ class Results:
     survival: list[dict[str, dict[str, float]]]
     failsafe: list[dict[str, Any]]
     videos: list[Path]
-    rendered: bool
+    notes: list[str]
 
 
 def run_evaluation(
@@ -99,13 +99,13 @@ def run_evaluation(
         survival.append(
             survival_figures(agent, start_policy, split, int(survive["worlds"]), int(survive["seed"]), threads)
         )
-    rendered = any(v is not None and v.rendered for v in videos)
     about = {
         "command": shlex.join(sys.orig_argv),
         "checkpoints": [str(agent.path) for agent in agents],
         "split": split,
         "corruption": agents[0].config.get("corruption"),
-        "rendered_video": rendered,
+        "rendered_video": any(v is not None and v.rendered for v in videos),
+        "filmed_video": any(v is not None and not v.rendered for v in videos),
         "settings": {key: config[key] for key in ("failsafe", "contact", "interval", "survival")},
         "survival": survival,
         "failsafe": guarded,
@@ -125,13 +125,13 @@ def run_evaluation(
         motions = {"reference": result.reference, "estimate": result.motion}
         report.write_side_by_side(path, material.humanoid, motions, video, fragment.start, int(config["video"]["size"]))
         written.append(path)
-    return Results(out, comparison, survival, guarded, written, rendered)
+    return Results(out, comparison, survival, guarded, written, report.rendered_notes(about))
 
 
 def summary(results: Results) -> str:
     """What the terminal shows at the end."""
     from egopose.evaluation import tables, triggers
-    from egopose.evaluation.report import HEADLINE, RENDERED_NOTE
+    from egopose.evaluation.report import HEADLINE
 
     lines = [tables.as_text(results.comparison, HEADLINE)]
     for run, figures in enumerate(results.survival):
@@ -139,8 +139,7 @@ def summary(results: Results) -> str:
         lines.append(f"frames survived (run {run}): {parts}")
     lines += [f"fail-safe (run {run}): {triggers.as_text(found)}" for run, found in enumerate(results.failsafe)]
     lines += [f"video: {path}" for path in results.videos]
-    lines += [RENDERED_NOTE] if results.rendered else []
-    return "\n".join([*lines, f"all results: {results.folder}"])
+    return "\n".join([*lines, *results.notes, f"all results: {results.folder}"])
 
 
 def output_folder(out: str | None, checkpoint: Path, split: str) -> Path:

@@ -183,8 +183,10 @@ def find_offset(head: Array, camera: Array, settings: SyncSettings, source: str 
             source,
             "sync_offset",
             f"no offset stands out: {found.offset:.3f} s explains hardly more than another (confidence "
-            f"{confidence:.2f}, {settings.confidence:g} is needed). Check that video and motion are of one take, give "
-            "a longer motion with quick turns of the head, or measure the offset at a clap and give it as a number",
+            f"{confidence:.2f}, {settings.confidence:g} is needed). Check that video and motion are of one take and at "
+            f"their true speed (they last {len(camera) / settings.rate:.1f} and {seconds:.1f} s; a BVH's Frame Time, "
+            "camera.fps), give a longer motion with quick turns of the head, or measure the offset at a clap and give "
+            "it as a number",
         )
     return found
 

@@ -18,7 +18,7 @@ from egopose.errors import InputError
 from egopose.evaluation import charts, page
 from egopose.evaluation.charts import Line
 from egopose.evaluation.protocols import METRICS
-from egopose.evaluation.report import RENDERED_NOTE
+from egopose.evaluation.report import rendered_notes
 from egopose.humanoid.model import HumanoidModel
 from egopose.motion.io import read_motion
 from egopose.motion.motion import Motion
@@ -148,8 +148,7 @@ def _about(results: Mapping[str, Any]) -> str:
         f"<p>{runs} run{'s' if runs > 1 else ''} on {len(results['takes'])} fragments, split "
         f"{escape(str(results.get('split')))}. Curves and pictures are of the first run.</p>"
     ]
-    if results.get("rendered_video"):
-        lines.append(f"<p><strong>{escape(RENDERED_NOTE)}</strong></p>")
+    lines += [f"<p><strong>{escape(note)}</strong></p>" for note in rendered_notes(results)]
     lines += [f"<p>Checkpoint: <code>{escape(str(c))}</code></p>" for c in results.get("checkpoints", [])]
     if command := results.get("command"):
         lines.append(f"<p>Made by</p><pre>{escape(str(command))}</pre>")

@@ -20,6 +20,7 @@ from egopose.vision.video import iter_frames, write_video
 OURS, BASELINE = "ours", "PoseReg"
 FOOTAGE = "wearer.json"
 RENDERED_NOTE = "The wearer's video was rendered from real motion capture, not filmed."
+PARTLY_RENDERED_NOTE = "The wearer's video of some takes was rendered from real motion capture, not filmed."
 HEADLINE = ("E_pose", "E_vel", "A_accl", "mpjpe_root_aligned", "root_drift", "foot_skate", "contact_accuracy")
 
 
@@ -59,7 +60,7 @@ def write_results(
 ) -> None:
     """``results.json``, ``results.md`` and ``takes.csv`` in ``folder``.
 
-    ``about`` goes into the JSON beside the figures; it says at least ``split`` and ``rendered_video``.
+    ``about`` goes into the JSON beside the figures; it says at least ``split`` and what :func:`rendered_notes` reads.
     """
     folder.mkdir(parents=True, exist_ok=True)
     reference = {m.key: m.scale * _mean([take.reference_scores.figure(m.key) for take in runs[0]]) for m in METRICS}
@@ -70,9 +71,16 @@ def write_results(
     runs_and_takes = (
         f"{len(runs)} run{'s' if len(runs) > 1 else ''} on {len(runs[0])} fragments, split {about['split']}."
     )
-    notes = [runs_and_takes, *([RENDERED_NOTE] if about["rendered_video"] else [])]
+    notes = [runs_and_takes, *rendered_notes(about)]
     (folder / "results.md").write_text(tables.as_markdown(comparison) + "\n" + "\n".join(notes) + "\n")
     tables.write_csv(folder / "takes.csv", comparison)
+
+
+def rendered_notes(about: Mapping[str, Any]) -> list[str]:
+    """What is to be said where ``rendered_video`` is true of any take, and ``filmed_video`` perhaps of others."""
+    if not about["rendered_video"]:
+        return []
+    return [PARTLY_RENDERED_NOTE if about.get("filmed_video") else RENDERED_NOTE]
 
 
 def write_take(folder: Path, result: FragmentResult) -> Path:
