@@ -31,7 +31,9 @@ def test_rates_and_keys() -> None:
     loop = collector(env)
     result = compare_with_raw(iter(loop), env.physics, rounds=3)
     loop.shutdown()
-    assert {"ratio", "control_steps_per_s", "raw_steps_per_s", "substeps", "worlds", "threads"} <= set(result)
+    assert {"ratio", "cpu_ratio", "control_steps_per_s", "raw_steps_per_s", "substeps", "worlds", "threads"} <= set(
+        result
+    )
     assert (result["worlds"], result["threads"]) == (4, 2)
     # A batch of collection can never cost less than its physics by much; noise aside.
     assert 0 < result["ratio"] < 1.5

@@ -88,23 +88,26 @@ def compare_with_raw(batches: Iterator[Any], physics: BatchedPhysics, rounds: in
         rounds: of one collected batch and its raw replay each.
 
     Returns:
-        ``ratio`` (the median round's), ``control_steps_per_s``, ``raw_steps_per_s`` (medians), ``substeps``,
-        ``worlds``, ``threads``, ``rounds``.
+        ``ratio`` (the median round's), ``cpu_ratio`` (of the processor's time in the place of the clock's, which other
+        programs disturb less), ``control_steps_per_s``, ``raw_steps_per_s`` (medians), ``substeps``, ``worlds``,
+        ``threads``, ``rounds``.
     """
     recorder, replay = StepRecorder(physics), RawReplay(physics)
     next(batches)
-    loop_rates, raw_rates = [], []
+    loop_rates, raw_rates, cpu_ratios = [], [], []
     for _ in range(rounds):
         recorder.clear()
-        start = time.perf_counter()
+        start, cpu = time.perf_counter(), time.process_time()
         next(batches)
-        elapsed = time.perf_counter() - start
+        elapsed, between = time.perf_counter() - start, time.process_time()
         steps = len(recorder.states) * physics.n_worlds
         loop_rates.append(steps / elapsed)
         raw_rates.append(steps / replay.run(recorder.states, recorder.ctrls))
+        cpu_ratios.append((time.process_time() - between) / (between - cpu))
     replay.close()
     return {
         "ratio": statistics.median(a / b for a, b in zip(loop_rates, raw_rates, strict=True)),
+        "cpu_ratio": statistics.median(cpu_ratios),
         "control_steps_per_s": statistics.median(loop_rates),
         "raw_steps_per_s": statistics.median(raw_rates),
         "substeps": physics.substeps,
