@@ -19,6 +19,7 @@ from test_training_config import command, launcher, start
 from toy_problem import make_run
 
 from egopose import bench
+from egopose.benchmarks.processes import end_of, family
 from egopose.envs.transforms import VisualContext
 from egopose.errors import InputError
 from egopose.training import checkpoint as checkpoints
@@ -46,15 +47,18 @@ def killed(capsys: pytest.CaptureFixture[str], rounds: int, *overrides: str) -> 
 def test_killed_at_random_moments_it_ends_as_if_left_alone(rounds: int, capsys: pytest.CaptureFixture[str]) -> None:
     result = killed(capsys, rounds)
     assert (result["kills"], result["bit_equal"], result["curves_equal"]) == (rounds, True, True)
+    assert (result["loaded_equal"], result["orphans"]) == (True, 0)
 
 
 @linux
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["multi_sync", "multi_async"])
-def test_with_workers_it_goes_on_to_its_end(kind: str, capsys: pytest.CaptureFixture[str]) -> None:
-    result = killed(capsys, 3, f"collector={kind}", "collector.workers=2", "collector.worlds=2")
-    assert (result["kills"], result["iterations"]) == (3, 24)
-    assert result["bit_equal"] or kind == "multi_async"
+def test_with_workers_nothing_is_lost_or_left(kind: str, capsys: pytest.CaptureFixture[str]) -> None:
+    result = killed(capsys, 3, f"collector={kind}", "collector.worlds=2")
+    assert (result["kills"], result["orphans"], result["iterations"]) == (3, 0, 15)
+    assert (result["loaded_equal"], result["curves_whole"]) == (True, True)
+    assert result["most_lost"] <= 2  # a checkpoint every second iteration
+    assert (result["bit_equal"], result["curves_equal"]) == ((None, None) if kind == "multi_async" else (True, True))
 
 
 # --- checkpoints -----------------------------------------------------------------------------------------------------
@@ -226,6 +230,45 @@ def test_workers_outlive_ctrl_c_and_are_missed_when_killed(tmp_path: Path) -> No
     assert str(found) in str(caught.value)
     # A checkpoint every third iteration, and one of the last whole one when the worker was missed.
     assert checkpoints.verify(found)["iteration"] == 4
+
+
+LONG_STEP = """
+import os, sys, time
+sys.path.insert(0, {tests!r})
+from egopose.runtime import prepare_runtime
+prepare_runtime()
+from functools import partial
+from torchrl.envs import TransformedEnv
+from toy_problem import COLLECTOR, ToyEnv, networks
+from egopose.training.collectors import CollectorSettings, build_collector
+
+class Slow(ToyEnv):
+    def _step(self, tensordict):
+        print("step", os.getpid(), flush=True)
+        time.sleep(600)
+
+def slow(worker):
+    return TransformedEnv(Slow(2))
+
+if __name__ == "__main__":
+    settings = CollectorSettings.from_config({{**COLLECTOR, "kind": {kind!r}, "workers": 2}})
+    next(iter(build_collector(settings, slow, networks()[0], 8)))
+"""
+
+
+@linux
+def test_a_killed_learner_leaves_no_workers(tmp_path: Path) -> None:
+    """Not even such as are in the middle of a step that takes ten minutes."""
+    program = tmp_path / "program.py"
+    program.write_text(LONG_STEP.format(tests=str(Path(__file__).parent)))
+    with subprocess.Popen([sys.executable, str(program)], stdout=subprocess.PIPE, text=True) as learner:
+        assert learner.stdout is not None
+        steps = [learner.stdout.readline().split() for _ in range(2)]
+        started = family(os.getpid())
+        workers = {process for process in started if process[0] in {int(pid) for _, pid in steps}}
+        assert len(workers) == 2
+        learner.kill()
+    assert end_of(workers, 20)[1] == set()
 
 
 def test_nan_ends_in_a_message_and_the_checkpoint_before_goes_on(tmp_path: Path) -> None:
