@@ -125,7 +125,10 @@ def test_an_agent_for_other_features_is_refused(trained: Path, material: Materia
 
 def test_torchrl_evaluator_runs_it(trained: Path, material: Material) -> None:
     agent = pipeline.load_agent(trained, material, which="latest")
-    evaluator = Evaluator(agent.make_env(worlds=2), agent.actor, num_trajectories=2, max_steps=12)
+    layout = {"auto_register_policy_transforms": False, "traj_format": "padded"}  # TorchRL's next defaults differ
+    evaluator = Evaluator(
+        agent.make_env(worlds=2), agent.actor, num_trajectories=2, max_steps=12, collector_kwargs=layout
+    )
     try:
         result = evaluator.evaluate()
     finally:
