@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import csv
+import importlib.util
 import json
 import os
 import shutil
 import signal
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 from typing import Any
@@ -31,6 +33,10 @@ from egopose.untrusted import load_tensors
 
 __all__ = ["launcher"]  # a fixture
 
+needs_ray = pytest.mark.skipif(importlib.util.find_spec("ray") is None, reason="needs Ray: pip install 'egopose[ray]'")
+needs_joblib = pytest.mark.skipif(
+    importlib.util.find_spec("hydra_plugins.hydra_joblib_launcher") is None, reason="needs pip install 'egopose[sweep]'"
+)
 linux = pytest.mark.skipif(sys.platform != "linux", reason="kills processes")
 
 
@@ -52,7 +58,7 @@ def test_killed_at_random_moments_it_ends_as_if_left_alone(rounds: int, capsys: 
 
 @linux
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", ["multi_sync", "multi_async"])
+@pytest.mark.parametrize("kind", ["multi_sync", "multi_async", pytest.param("ray", marks=needs_ray)])
 def test_with_workers_nothing_is_lost_or_left(kind: str, capsys: pytest.CaptureFixture[str]) -> None:
     result = killed(capsys, 3, f"collector={kind}", "collector.worlds=2")
     assert (result["kills"], result["orphans"], result["iterations"]) == (3, 0, 15)
@@ -257,10 +263,11 @@ if __name__ == "__main__":
 
 
 @linux
-def test_a_killed_learner_leaves_no_workers(tmp_path: Path) -> None:
+@pytest.mark.parametrize("kind", ["multi_sync", pytest.param("multi_async", marks=pytest.mark.slow)])
+def test_a_killed_learner_leaves_no_workers(kind: str, tmp_path: Path) -> None:
     """Not even such as are in the middle of a step that takes ten minutes."""
     program = tmp_path / "program.py"
-    program.write_text(LONG_STEP.format(tests=str(Path(__file__).parent)))
+    program.write_text(LONG_STEP.format(tests=str(Path(__file__).parent), kind=kind))
     with subprocess.Popen([sys.executable, str(program)], stdout=subprocess.PIPE, text=True) as learner:
         assert learner.stdout is not None
         steps = [learner.stdout.readline().split() for _ in range(2)]
@@ -269,6 +276,32 @@ def test_a_killed_learner_leaves_no_workers(tmp_path: Path) -> None:
         assert len(workers) == 2
         learner.kill()
     assert end_of(workers, 20)[1] == set()
+
+
+@linux
+@pytest.mark.slow
+@needs_ray
+@pytest.mark.parametrize("between", [True, False], ids=["between-batches", "in-a-batch"])
+def test_a_killed_worker_of_ray_is_missed(between: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parent), prepend=os.pathsep)
+    run = make_run(tmp_path, iterations=9, collector={"kind": "ray", "workers": 2}, evaluate_every=1)
+    names = {pid: Path(f"/proc/{pid}/comm").read_text() for pid, _ in family(os.getpid())}
+    worker = next(pid for pid, name in names.items() if name.startswith("ray::Worker"))
+
+    def strike(iteration: int) -> dict[str, float]:
+        if iteration == 4:
+            threading.Timer(0.0 if between else 0.01, os.kill, (worker, signal.SIGKILL)).start()
+            time.sleep(1.0 if between else 0.0)
+        return {"score": 0.0}
+
+    try:
+        with pytest.raises(TrainingStopped, match="a worker of Ray ended") as caught:
+            train(run, [], strike)
+    finally:
+        run.collector.shutdown()
+    found = checkpoints.find_checkpoint(tmp_path)
+    assert str(found) in str(caught.value)
+    assert checkpoints.verify(found)["iteration"] >= 4
 
 
 def test_nan_ends_in_a_message_and_the_checkpoint_before_goes_on(tmp_path: Path) -> None:
@@ -341,9 +374,25 @@ def test_resumed_from_another_directory_before_its_first_checkpoint(done: Path, 
     assert rows[0] == rows[1]
 
 
+#: joblib's processes know nothing of the program they work for: on their path, this brings them its stand-in.
+STAND_IN = """
+import sys
+from importlib.util import spec_from_file_location
+
+class Finder:
+    def find_spec(self, name, path=None, target=None):
+        return spec_from_file_location(name, {launcher!r}) if name == "egopose.pipeline" else None
+
+sys.meta_path.insert(0, Finder())
+"""
+
+
+@pytest.mark.parametrize("how", ["basic", pytest.param("local", marks=[needs_joblib, pytest.mark.slow], id="joblib")])
 def test_a_sweep_runs_no_finished_job_again_and_goes_on_with_a_half_one(
-    done: Path, launcher: Path, tmp_path: Path
+    how: str, done: Path, launcher: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    (tmp_path / "sitecustomize.py").write_text(STAND_IN.format(launcher=str(launcher)))
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path), prepend=os.pathsep)
     jobs = [tmp_path / "sweep" / number for number in "012"]
     for job in jobs[:2]:
         shutil.copytree(done, job)
@@ -353,7 +402,13 @@ def test_a_sweep_runs_no_finished_job_again_and_goes_on_with_a_half_one(
     written = checkpoints.find_checkpoint(jobs[0]).stat().st_mtime_ns
     same = ("algo.iterations=3", "training.checkpoint_every=1", "logger=csv")
     code, out, err = command(
-        launcher, tmp_path, "--multirun", "hydra.sweep.dir=sweep", *same, "training.evaluation_seed=1,2,3"
+        launcher,
+        tmp_path,
+        "--multirun",
+        "hydra.sweep.dir=sweep",
+        *same,
+        f"hydra/launcher={how}",
+        "training.evaluation_seed=1,2,3",
     )
     assert code == 0, err
     assert f"{jobs[0]}: finished already after 3 iterations" in out
@@ -405,6 +460,32 @@ def test_one_process_trains_in_a_run_directory(tmp_path: Path) -> None:
         pass
     with only_process(tmp_path):
         pass
+
+
+@linux
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["multi_sync", "multi_async", pytest.param("ray", marks=needs_ray)])
+def test_ctrl_c_at_a_terminal_saves_whatever_collects(
+    kind: str, launcher: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A terminal sends it to every process of the command."""
+    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parent), prepend=os.pathsep)
+    words = ("algo.iterations=100000", "training.checkpoint_every=1", f"collector={kind}", "logger=csv")
+    process = start(launcher, tmp_path, *words, start_new_session=True)
+    assert process.stdout is not None
+    folder = Path(process.stdout.readline().strip().removeprefix("run directory: "))
+    while len(list(folder.glob("checkpoints/checkpoint-*"))) < 2:
+        assert process.poll() is None
+    started = family(process.pid)
+    os.killpg(process.pid, signal.SIGINT)
+    out, err = process.communicate(timeout=60)
+    assert process.returncode == 130, err
+    assert f"python -m egopose.train resume={folder}" in out
+    found = checkpoints.recover(folder)
+    assert found is not None
+    with (folder / "curves.csv").open() as file:
+        assert checkpoints.verify(found)["iteration"] == float(list(csv.DictReader(file))[-1]["iteration"])
+    assert end_of(started, 20)[1] == set()
 
 
 @linux

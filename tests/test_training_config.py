@@ -134,10 +134,13 @@ from egopose.runtime import prepare_runtime
 prepare_runtime()
 from toy_problem import make_run
 stand_in = types.ModuleType("egopose.pipeline")
+from egopose.training.loop import interrupts_held
 def build_run(config, folder, material):
-    return make_run(folder, seed=config["seed"], config=config, iterations=config["algo"]["iterations"],
-                    checkpoint_every=config["training"]["checkpoint_every"],
-                    max_seconds=config["training"]["max_seconds"])
+    with interrupts_held():
+        return make_run(folder, seed=config["seed"], config=config, iterations=config["algo"]["iterations"],
+                        checkpoint_every=config["training"]["checkpoint_every"],
+                        max_seconds=config["training"]["max_seconds"],
+                        collector={{name: config["collector"][name] for name in ("kind", "workers")}})
 stand_in.build_run = build_run
 stand_in.load_material = lambda config: None
 stand_in.run_material = lambda config, folder: None
@@ -146,7 +149,8 @@ sys.modules["egopose.pipeline"] = stand_in
 import egopose
 egopose.pipeline = stand_in
 from egopose.train import main
-main()
+if __name__ == "__main__":
+    main()
 """
 
 
@@ -157,7 +161,7 @@ def launcher(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def start(launcher: Path, cwd: Path, *words: str) -> subprocess.Popen[str]:
+def start(launcher: Path, cwd: Path, *words: str, **how: Any) -> subprocess.Popen[str]:
     return subprocess.Popen(
         [sys.executable, str(launcher), *words],
         cwd=cwd,
@@ -165,6 +169,7 @@ def start(launcher: Path, cwd: Path, *words: str) -> subprocess.Popen[str]:
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         env=os.environ | {"OMP_NUM_THREADS": "1"},
+        **how,
     )
 
 
