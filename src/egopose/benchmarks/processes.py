@@ -35,6 +35,17 @@ def end_of(left: set[Process], seconds: float) -> tuple[float, set[Process]]:
     return time.monotonic() - begin, left
 
 
+def of_commands(processes: set[Process], *words: str) -> set[Process]:
+    """Those whose command line has one of the words in it."""
+    found = set()
+    for process in processes:
+        with suppress(OSError):  # it has ended meanwhile
+            line = Path(f"/proc/{process[0]}/cmdline").read_bytes().decode(errors="replace")
+            if any(word in line for word in words):
+                found.add(process)
+    return found
+
+
 def kill(processes: set[Process]) -> None:
     """SIGKILL to each that is still there."""
     found = _processes()

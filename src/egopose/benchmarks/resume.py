@@ -38,6 +38,10 @@ SMALL = (
 _BEFORE = 0.3
 _WINDOW = 4
 _PATIENCE = 30.0  # s for what a killed training leaves behind to end
+#: Processes of Ray's own that outlive its killed head: for a minute they try to tell it of that. They hold nothing of a
+#: training: the next start does not wait for them, the benchmark's end does.
+_RAY_AGENTS = ("ray::DashboardAgent", "ray::RuntimeEnvAgent", "ray/dashboard/agent.py", "ray/_private/runtime_env")
+_AGENTS_PATIENCE = 120.0
 _TIMES = ("steps_per_s", "seconds_collect", "seconds_gae", "seconds_update")
 
 
@@ -59,9 +63,9 @@ def run(overrides: Sequence[str], rounds: int) -> dict[str, Any]:
         ``curves_equal``: the same of the figures in ``curves.csv``; ``curves_whole``: whether every iteration stands
         there once. ``loaded``: how many starts came to take over a checkpoint; ``loaded_equal``: whether each took the
         newest whole one on the disk and then held, workers included, what stands in it, bit by bit; ``most_lost``
-        iterations at a kill. ``orphans``: processes of killed trainings that were left half a minute later;
-        ``seconds_until_gone`` of the slowest other. ``iterations``, ``collector``, ``seconds`` in all and
-        ``seconds_a_start`` until the first iteration (median).
+        iterations at a kill. ``orphans``: processes of killed trainings that were left half a minute later, Ray's
+        agents two minutes after the end; ``seconds_until_gone`` of the slowest other, the agents aside. ``iterations``,
+        ``collector``, ``seconds`` in all and ``seconds_a_start`` until the first iteration (median).
 
     Raises:
         InputError: a setting is unknown or out of range.
@@ -93,6 +97,7 @@ def run(overrides: Sequence[str], rounds: int) -> dict[str, Any]:
         for _ in range(rounds):
             campaign.kill()
         _finish(_start(context, config, killed, rounds), killed)
+        campaign.wait_for_agents()
         end = find_checkpoint(killed)
         differs = unequal(content(find_checkpoint(alone)), content(end)) if in_step else []
         curves = _curves(killed)
@@ -138,6 +143,7 @@ class _Campaign:
         self.seconds_until_gone = 0.0
         self._notes = Notes(folder.with_suffix(NOTES))
         self._iteration = 0.5  # s; of the last one seen
+        self._agents: set[processes.Process] = set()
 
     def kill(self) -> None:
         """Start it, kill it at a random moment, and wait for all its processes to end."""
@@ -157,9 +163,10 @@ class _Campaign:
         if process.exitcode != -9:
             _finish(process, self.folder)
             raise RuntimeError("training came to its end before it was killed")
-        seconds, left = processes.end_of(family | (processes.family(os.getpid()) - others), _PATIENCE)
-        self.orphans += len(left)
-        processes.kill(left)
+        family |= processes.family(os.getpid()) - others
+        agents = processes.of_commands(family, *_RAY_AGENTS)
+        self._agents |= agents
+        seconds, left = self._left(family - agents, _PATIENCE)
         self.seconds_until_gone = max(self.seconds_until_gone, 0.0 if left else seconds)
 
         phase, _, done = self._notes.read()
@@ -171,6 +178,16 @@ class _Campaign:
         self.newest.append(None if newest is None else newest.name)
         if done:
             self.most_lost = max(self.most_lost, done - (trainer_state(newest)["iteration"] if newest else 0))
+
+    def wait_for_agents(self) -> None:
+        """For what Ray takes longer to end."""
+        self._left(self._agents, _AGENTS_PATIENCE)
+
+    def _left(self, family: set[processes.Process], patience: float) -> tuple[float, set[processes.Process]]:
+        seconds, left = processes.end_of(family, patience)
+        self.orphans += len(left)
+        processes.kill(left)
+        return seconds, left
 
     def newest_taken(self, loads: Sequence[Mapping[str, Any]]) -> bool:
         """Whether each start that came so far took over what was the newest whole checkpoint at the kill before it."""
