@@ -27,7 +27,7 @@ from egopose.data.preparation import flow_name, store_folder  # noqa: E402
 from egopose.data.store import TakeStore  # noqa: E402
 from egopose.errors import InputError  # noqa: E402
 from egopose.evaluation.agents import evaluate_agent  # noqa: E402
-from egopose.evaluation.protocols import ContactSettings, raw_figures  # noqa: E402
+from egopose.evaluation.protocols import ContactSettings, fragment_names, raw_figures  # noqa: E402
 from egopose.evaluation.tables import write_json  # noqa: E402
 from egopose.inference.failsafe import FailSafeSettings  # noqa: E402
 from egopose.material import run_material  # noqa: E402
@@ -87,8 +87,7 @@ def _path_pose(run: Path, config: Mapping[str, Any], contact: ContactSettings) -
 
 
 def _labels(config: Mapping[str, Any], fragments: Sequence[Any]) -> list[str]:
-    store = TakeStore.open(store_folder(config))
-    return [store.fragment_name(fragment) for fragment in fragments]
+    return fragment_names([take.name for take in TakeStore.open(store_folder(config)).takes], fragments)
 
 
 def judge_all(runs: Sequence[Path], corruptions: Sequence[str], results: Path, workers: int | None = None) -> None:

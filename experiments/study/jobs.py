@@ -19,7 +19,7 @@ from egopose.data.preparation import flow_name, store_folder
 from egopose.data.store import TakeStore
 from egopose.evaluation.agents import evaluate_agent
 from egopose.evaluation.forecasting import ForecastWindow, forecast_windows, score_forecasts, true_futures
-from egopose.evaluation.protocols import ContactSettings, raw_figures
+from egopose.evaluation.protocols import ContactSettings, fragment_names, raw_figures
 from egopose.evaluation.survival import base_tracking, frames_survived, reference_tracking
 from egopose.evaluation.tables import write_json
 from egopose.forecast_contexts import past_states
@@ -100,8 +100,7 @@ def _material(folder: Path, config: dict[str, Any], judged: dict[str, Any]) -> M
 
 
 def _labels(config: dict[str, Any], fragments: Sequence[Any]) -> list[str]:
-    store = TakeStore.open(store_folder(config))
-    return [store.fragment_name(fragment) for fragment in fragments]
+    return fragment_names([take.name for take in TakeStore.open(store_folder(config)).takes], fragments)
 
 
 def _estimates(

@@ -69,7 +69,7 @@ def run_evaluation(
 
     from egopose.evaluation import report
     from egopose.evaluation.agents import evaluate_agent, failsafe_figures, survival_figures
-    from egopose.evaluation.protocols import ContactSettings
+    from egopose.evaluation.protocols import ContactSettings, fragment_names
     from egopose.inference.failsafe import FailSafeSettings
     from egopose.pipeline import build_networks
 
@@ -82,7 +82,7 @@ def run_evaluation(
     fragments = list(material.train if split == "train" else material.test)
     if not fragments:
         raise InputError(source, "split", f"the data has no {split} fragments")
-    labels = [f"{names[f.take]}_{f.start}-{f.stop}" for f in fragments]
+    labels = fragment_names(names, fragments)
 
     window = int(config["failsafe_report"]["window"])
     runs = [evaluate_agent(agent, fragments, labels, split, failsafe, contact, threads, window) for agent in agents]

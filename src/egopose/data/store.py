@@ -169,10 +169,6 @@ class TakeStore:
         info = self.takes[take]
         return slice(info.offset, info.offset + info.length)
 
-    def fragment_name(self, fragment: Fragment) -> str:
-        """``TAKE_START-STOP``, by which figures of a fragment are known."""
-        return f"{self.takes[fragment.take].name}_{fragment.start}-{fragment.stop}"
-
     def clip(self, take: int) -> Motion:
         """The reference clip of a take."""
         return read_motion(self.root / "clips" / f"{self.takes[take].name}.motion.npz")

@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+from egopose.envs.starts import FragmentLike
 from egopose.evaluation import metrics, position_metrics
 from egopose.evaluation.keypoints import motion_keypoints, side_view_error
 from egopose.evaluation.statistics import Interval, mean_interval, ratio_interval
@@ -127,6 +128,11 @@ def score_take(
         "E_key": side_view_error(seen, true_seen)[0],
     }
     return TakeScores(name, frames, scalars, resets)
+
+
+def fragment_names(takes: Sequence[str], fragments: Sequence[FragmentLike]) -> list[str]:
+    """``TAKE_START-STOP`` of each, by which its figures are known; ``takes`` are the names of all takes."""
+    return [f"{takes[f.take]}_{f.start}-{f.stop}" for f in fragments]
 
 
 def raw_figures(scores: Sequence[TakeScores]) -> dict[str, Any]:
