@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 
     from egopose.humanoid.model import HumanoidModel
     from egopose.inference.causal import CausalRegression
+    from egopose.inference.planning import PlannerSettings
     from egopose.material import Material
     from egopose.models.regressor import StateRegressor
     from egopose.motion.motion import Motion
@@ -186,15 +187,23 @@ def run_estimate(config: Mapping[str, Any], agent: Agent, pose_motion: Motion, v
     from egopose.evaluation.tables import write_columns_csv
     from egopose.inference.estimator import estimate_takes
     from egopose.inference.failsafe import FailSafe, FailSafeSettings
+    from egopose.inference.planning import Planner
     from egopose.vision.lens import Camera
 
     failsafe = from_mapping(FailSafeSettings, config["failsafe"], "conf/estimate.yaml: failsafe")
     guard = FailSafe(1, failsafe.for_run(agent.config))
     torch.set_num_threads(1)
-    env = agent.make_env("test", worlds=1, threads=1, whole_fragments=True, falls_end=False)
-    lookahead = allowed_lookahead(config)
-    (estimate,) = estimate_takes(env, agent.actor, agent.critic, agent.followed_states(), guard, lookahead)
+    options = {"threads": 1, "whole_fragments": True, "falls_end": False}
+    env = agent.make_env("test", worlds=1, **options)
+    lookahead, settings, states = allowed_lookahead(config), allowed_planner(config), agent.followed_states()
+    planner = None
+    if settings is not None:
+        copies = agent.make_env("test", worlds=settings.samples, **{**options, "threads": int(config["threads"])})
+        planner = Planner(copies, agent.actor, agent.critic, states, settings)
+    (estimate,) = estimate_takes(env, agent.actor, agent.critic, states, guard, lookahead, planner=planner)
     env.close()
+    if planner is not None:
+        planner.close()
     humanoid = agent.material.humanoid
     motion = estimate.motion(humanoid, pose_motion.name)
     out.mkdir(parents=True, exist_ok=True)
@@ -207,6 +216,20 @@ def run_estimate(config: Mapping[str, Any], agent: Agent, pose_motion: Motion, v
     write_side_by_side(out / "side_by_side.mp4", humanoid, motions, seen, 0, int(config["size"]))
     print(f"{len(motion)} frames, {estimate.n_resets} resets by the fail-safe; written to {out}", flush=True)
     return out
+
+
+def allowed_planner(config: Mapping[str, Any]) -> PlannerSettings | None:
+    """How the body looks ahead by ``conf/estimate.yaml``, None for not at all.
+
+    What is seen live is known for ``lookahead`` frames, and a planner's horizon is longer: ``causal`` goes without.
+
+    Raises:
+        InputError: a setting is missing or wrong.
+    """
+    from egopose.inference.planning import planner_settings
+
+    settings = planner_settings(config.get("planner"))
+    return None if config["causal"] else settings
 
 
 def allowed_lookahead(config: Mapping[str, Any]) -> int | None:

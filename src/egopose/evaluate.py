@@ -71,11 +71,13 @@ def run_evaluation(
     from egopose.evaluation.agents import evaluate_agent, failsafe_figures, survival_figures
     from egopose.evaluation.protocols import ContactSettings, fragment_names
     from egopose.inference.failsafe import FailSafeSettings
+    from egopose.inference.planning import planner_settings
     from egopose.pipeline import build_networks
 
     source = "conf/evaluate.yaml"
     failsafe = from_mapping(FailSafeSettings, config["failsafe"], f"{source}: failsafe")
     contact = from_mapping(ContactSettings, config["contact"], f"{source}: contact")
+    planner = planner_settings(config.get("planner"))
     split, threads, material = str(config["split"]), int(config["threads"]), agents[0].material
     if split not in ("train", "test"):
         raise InputError(source, "split", f"must be train or test, not {split!r}")
@@ -85,7 +87,9 @@ def run_evaluation(
     labels = fragment_names(names, fragments)
 
     window = int(config["failsafe_report"]["window"])
-    runs = [evaluate_agent(agent, fragments, labels, split, failsafe, contact, threads, window) for agent in agents]
+    runs = [
+        evaluate_agent(agent, fragments, labels, split, failsafe, contact, threads, window, planner) for agent in agents
+    ]
     guards = [failsafe.for_run(agent.config) for agent in agents]
     guarded = [failsafe_figures(run, guard, window) for run, guard in zip(runs, guards, strict=True)]
     interval, survive = config["interval"], config["survival"]
@@ -106,7 +110,7 @@ def run_evaluation(
         "corruption": agents[0].config.get("corruption"),
         "rendered_video": any(v is not None and v.rendered for v in videos),
         "filmed_video": any(v is not None and not v.rendered for v in videos),
-        "settings": {key: config[key] for key in ("failsafe", "contact", "interval", "survival")},
+        "settings": {key: config.get(key) for key in ("failsafe", "planner", "contact", "interval", "survival")},
         "survival": survival,
         "failsafe": guarded,
     }

@@ -17,6 +17,7 @@ from egopose.evaluation.triggers import TakeTriggers, as_dict, take_triggers
 from egopose.inference.estimator import Controller, Estimate, estimate_takes
 from egopose.inference.failsafe import FailSafe, FailSafeSettings
 from egopose.inference.forks import Forks
+from egopose.inference.planning import Planner, PlannerSettings
 from egopose.models.pose_regression import pose_regression
 from egopose.motion import rotations as rot
 from egopose.motion.motion import Motion
@@ -55,6 +56,7 @@ def evaluate_agent(
     contact: ContactSettings,
     threads: int,
     window: int | None = None,
+    planner: PlannerSettings | None = None,
 ) -> list[FragmentResult]:
     """Estimate every fragment in one pass, all side by side, and score it beside PoseReg.
 
@@ -67,6 +69,7 @@ def evaluate_agent(
         contact: when a sole stands.
         threads: of the physics.
         window: frames after a trigger within which the body must have fallen without it; None to judge no triggers.
+        planner: how the body looks ahead; None for the policy alone.
 
     Raises:
         InputError: there are no regressed states, or a fragment is shorter than 4 frames.
@@ -77,7 +80,7 @@ def evaluate_agent(
     for fragment, name in zip(fragments, names, strict=True):
         if fragment.stop - fragment.start < SHORTEST:
             raise InputError(name, "length", f"{fragment.stop - fragment.start} frames; metrics need {SHORTEST}")
-    estimates, triggers = estimate_and_judge(agent, len(fragments), split, failsafe, threads, window)
+    estimates, triggers = estimate_and_judge(agent, len(fragments), split, failsafe, threads, window, planner)
     return [
         _result(agent, fragment, name, estimate, contact, judged)
         for fragment, name, estimate, judged in zip(fragments, names, estimates, triggers, strict=True)
@@ -85,7 +88,13 @@ def evaluate_agent(
 
 
 def estimate_and_judge(
-    agent: Agent, worlds: int, split: str, failsafe: FailSafeSettings, threads: int, window: int | None
+    agent: Agent,
+    worlds: int,
+    split: str,
+    failsafe: FailSafeSettings,
+    threads: int,
+    window: int | None,
+    planner: PlannerSettings | None = None,
 ) -> tuple[list[Estimate], Sequence[TakeTriggers | None]]:
     """Estimates of the first ``worlds`` fragments of ``split``, and the fail-safe's triggers, judged.
 
@@ -96,14 +105,21 @@ def estimate_and_judge(
         return agent.make_env(split, worlds=count, threads=threads, whole_fragments=True, falls_end=False)
 
     env, forks = make_env(worlds), Forks()
-    guard = FailSafe(worlds, failsafe.for_run(agent.config))
-    estimates = estimate_takes(env, agent.actor, agent.critic, agent.followed_states(), guard, forks=forks)
+    guard, states = FailSafe(worlds, failsafe.for_run(agent.config)), agent.followed_states()
+    ahead = (
+        None
+        if planner is None
+        else Planner(make_env(worlds * planner.samples), agent.actor, agent.critic, states, planner)
+    )
+    estimates = estimate_takes(env, agent.actor, agent.critic, states, guard, forks=forks, planner=ahead)
     env.close()
+    if ahead is not None:
+        ahead.close()
     if window is None:
         return estimates, [None] * worlds
     to_fall: list[dict[int, int | None]] = [{} for _ in estimates]
-    ahead = forks.frames_to_fall(make_env, agent.actor, window)
-    for (world, frame), frames in zip(forks.places, ahead, strict=True):
+    falls = forks.frames_to_fall(make_env, agent.actor, window)
+    for (world, frame), frames in zip(forks.places, falls, strict=True):
         to_fall[world][frame - estimates[world].start] = frames
     return estimates, [take_triggers(e, found, window) for e, found in zip(estimates, to_fall, strict=True)]
 

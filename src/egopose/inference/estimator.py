@@ -2,7 +2,8 @@
 
 Yuan & Kitani 2019, sections 3.1 and 3.3: the first state is the regressor's, placed where the person stands and faces;
 from there the policy's mean action drives the humanoid. Where the fail-safe triggers at frame t, the humanoid restarts
-at frame t + 1 from the regressor's state, at its own place and heading.
+at frame t + 1 from the regressor's state, at its own place and heading. With a planner, which is beyond the paper, the
+mean action is where planning begins, and V(s_t) is what the best plan is worth.
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ from egopose.humanoid.model import HumanoidModel
 from egopose.humanoid.soles import out_of_floor
 from egopose.inference.failsafe import FailSafe
 from egopose.inference.forks import Forks
+from egopose.inference.planning import Planner
 from egopose.models.episode_context import EpisodeContext
 from egopose.models.pose_regression import state_to_qpos
 from egopose.motion import rotations as rot
@@ -41,8 +43,8 @@ class Estimate:
     Attributes:
         start: global frame of the first row; the rows are frames ``start .. start + T - 1``.
         qpos: ``[T, nq]``.
-        value: ``[T]`` V(s_t).
-        confidence: ``[T]`` V(s_t) over its running mean, see :class:`~egopose.inference.failsafe.FailSafe`.
+        value: ``[T]`` V(s_t); with a planner what its best plan was worth.
+        confidence: ``[T]`` that over its running mean, see :class:`~egopose.inference.failsafe.FailSafe`.
         triggered: ``[T]`` frames at which the fail-safe triggered.
         resets: ``[T]`` frames whose state is the regressor's because the fail-safe triggered or the physics broke just
             before. The first frame is not counted.
@@ -95,6 +97,7 @@ def estimate_takes(
     guard: FailSafe,
     lookahead: int | None = None,
     forks: Forks | None = None,
+    planner: Planner | None = None,
 ) -> list[Estimate]:
     """Run every world's fragment from its first frame to its last.
 
@@ -109,6 +112,7 @@ def estimate_takes(
         lookahead: future frames that trainable contexts may see; None for the whole take. ``states`` and contexts that
             come with the observation are the caller's.
         forks: is told the states in which the fail-safe triggered.
+        planner: of as many bodies; None for the policy alone.
 
     Returns:
         One :class:`Estimate` a world; fragments may differ in length.
@@ -132,6 +136,9 @@ def estimate_takes(
             body = base.body_state()
             observation = critic(actor(observation))
             value = observation["state_value"].squeeze(-1)
+            if planner is not None:
+                observation["action"] = observation["action"] + planner.addition(base)
+                value = planner.value
             triggered = guard.update(value, body["xpos"][:, base.problem.humanoid.head, 2], t < lengths)
             frame = (body["qpos"], value, triggered, placed, observation["fallen"].squeeze(-1), diverged)
             for name, column in zip(rows, frame, strict=True):
@@ -146,6 +153,8 @@ def estimate_takes(
             again = placed.nonzero().squeeze(-1)
             if len(again):
                 _restart(base, again, states[start[again] + t + 1], body["qpos"][again])
+                if planner is not None:
+                    planner.forget(again)
                 after = env.transform(base.observe())
             observation = after.exclude("reward", "action")
     table = {name: torch.stack(column, dim=1).numpy() for name, column in rows.items()}

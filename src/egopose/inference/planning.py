@@ -1,0 +1,224 @@
+"""Looking ahead in the simulator: of many ways to go on, each simulated for some frames, the body takes the best.
+
+The body that acts a video out is simulated anyway, so what an action leads to can be tried before it is taken
+(predictive sampling: Howell et al. 2022, arXiv 2212.00541; the policy's value at the horizon's end: Lowrey et al. 2019,
+POLO). A way to go on is the policy's mean action plus an addition that changes smoothly; the policy reacts in each.
+What they are judged by is what the body follows, the state regressor's motion; the true motion plays no part.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+from torchrl.envs import TransformedEnv
+
+from egopose.envs.env import EgoPoseEnv
+from egopose.envs.forecasting import RecurrentStates
+from egopose.envs.mdp.rewards import Reward, build_reward
+from egopose.errors import InputError
+from egopose.models.pose_regression import state_to_qpos
+
+_EPISODE = ("take", "start", "stop", "frame")
+_BROKEN = 1000.0  # what a way loses whose physics break: more than any sum of rewards
+Controller = Callable[[TensorDictBase], TensorDictBase]
+
+
+@dataclass(frozen=True)
+class PlannerSettings:
+    """``conf/planner``; each file gives every value and its source.
+
+    Args:
+        samples: ways tried at a time.
+        horizon: frames they are simulated for.
+        every: frames between plans.
+        knot: frames between the knots of an addition, which is linear in between.
+        deviation: rad, of the largest additions at their knots; others are down to a tenth of it.
+        joints: only hinges whose name contains one of these are added to.
+        acceleration: reward lost per unit (m/s^2, rad/s^2) of the velocities' mean absolute change.
+        head: reward lost per metre by which the head is lower than what is followed has it.
+        discount: of a frame.
+        reward: as a file of ``conf/reward`` in the heading frame: how near the body is to what it follows.
+        seed: of the additions.
+    """
+
+    samples: int
+    horizon: int
+    every: int
+    knot: int
+    deviation: float
+    joints: tuple[str, ...]
+    acceleration: float
+    head: float
+    discount: float
+    reward: Any
+    seed: int
+
+    def __post_init__(self) -> None:
+        def check(ok: bool, name: str, cause: str) -> None:
+            if not ok:
+                raise InputError("planner", name, cause)
+
+        check(self.samples >= 2, "samples", "must be at least 2: without an addition, and with one")
+        check(0 < self.every <= self.horizon, "every", "must lie between 1 and the horizon")
+        check(self.knot > 0, "knot", "must be positive")
+        check(self.deviation > 0, "deviation", "must be positive")
+        check(min(self.acceleration, self.head) >= 0, "acceleration", "must not be negative, nor head")
+        check(0 < self.discount <= 1, "discount", "must lie in (0, 1]")
+        kind = self.reward.get("kind") if isinstance(self.reward, Mapping) else None
+        check(kind == "heading_frame", "reward", "must be one in the heading frame")
+
+
+class Planner:
+    """Plans for N bodies side by side; a copy of each tries ``samples`` ways.
+
+    Args:
+        env: of ``N * samples`` worlds like those that are planned for, falls not ending an episode, its normaliser
+            frozen.
+        actor, critic: policy and value network, in evaluation mode.
+        states: ``[F, 2 nq - 3]`` the regressor's humanoid state of every global frame, as the policy follows it.
+        settings: see :class:`PlannerSettings`.
+
+    Attributes:
+        value: ``[N]`` what the best way was worth: discounted rewards and, at the horizon, V.
+
+    Raises:
+        InputError: actions are torques, the policy has a memory, or no hinge is named.
+    """
+
+    def __init__(
+        self, env: TransformedEnv, actor: Controller, critic: Controller, states: Tensor, settings: PlannerSettings
+    ) -> None:
+        base = env.base_env
+        assert isinstance(base, EgoPoseEnv)
+        problem, humanoid = base.problem, base.problem.humanoid
+        if problem.action.kind != "pd":
+            raise InputError(
+                "planner", "action", "a planner moves targets of PD controllers, not torques: planner=null"
+            )
+        if any(isinstance(part, RecurrentStates) for part in env.transform):
+            raise InputError("planner", "model.memory", "a planner's ways begin without a memory: planner=null")
+        self.settings, self._env, self._base, self._actor, self._critic = settings, env, base, actor, critic
+        self._reward: Reward = build_reward(settings.reward)
+        env.reset()
+        self._followed, self._head_height = self._what_is_followed(states)
+        hinges = [joint.name for joint in humanoid.skeleton.joints for _ in joint.dofs]
+        chosen = [float(any(part in name for part in settings.joints)) for name in hinges]
+        if not any(chosen):
+            raise InputError("planner", "joints", f"none of {', '.join(settings.joints)} is part of a hinge's name")
+        self._deviation = settings.deviation * torch.tensor(chosen)
+        self._generator = torch.Generator().manual_seed(settings.seed)
+        worlds = base.batch_size[0] // settings.samples
+        self._plan = torch.zeros(worlds, settings.horizon + settings.every, len(hinges))
+        self._age = 0
+        self.value = torch.zeros(worlds)
+
+    def _what_is_followed(self, states: Tensor) -> tuple[dict[str, Tensor], Tensor]:
+        """What the reward reads of the regressor's bodies, and their heads' height ``[F]`` m.
+
+        They stand at the origin and face along x: nothing in the heading frame depends on it.
+        """
+        problem, worlds = self._base.problem, self._base.batch_size[0]
+        views: list[dict[str, Tensor]] = []
+        heights = []
+        for rows in states.split(worlds):
+            facing = np.array([1.0, 0.0, 0.0, 0.0])
+            qpos, qvel = state_to_qpos(rows.double().numpy(), np.zeros(2), facing, problem.humanoid.joint_range)
+            self._base.place(torch.arange(len(rows)), torch.from_numpy(qpos), torch.from_numpy(qvel))
+            body = problem.view(self._base.body_state()[: len(rows)])
+            views.append({name: getattr(body, name) for name in self._reward.reads})
+            heights.append(body.xpos[:, problem.humanoid.head, 2])
+        return {name: torch.cat([view[name] for view in views]) for name in self._reward.reads}, torch.cat(heights)
+
+    def addition(self, base: EgoPoseEnv) -> Tensor:
+        """``[N, nu]`` to add to the policy's mean action now, in the state of ``base`` (N worlds); planned anew where
+        it is time to."""
+        if self._age % self.settings.every == 0:
+            self._look_ahead(base)
+        self._age += 1
+        now = self._plan[:, 0].clone()
+        self._plan = self._plan.roll(-1, 1)
+        self._plan[:, -1] = 0.0
+        return now
+
+    def forget(self, worlds: Tensor) -> None:
+        """``worlds [n]`` were placed elsewhere: what was planned for them, and their value, hold no more."""
+        self._plan[worlds], self._age = 0.0, 0
+
+    def _ways(self) -> Tensor:
+        """``[K, N, H, nu]``: none, the plan so far, changes of it, and ways of their own."""
+        settings, (worlds, _, size) = self.settings, self._plan.shape
+        knots = -(-(settings.horizon - 1) // settings.knot) + 1
+        at_knots = torch.randn(settings.samples, worlds, knots, size, generator=self._generator) * self._deviation
+        at_knots *= 0.1 + 0.9 * torch.rand(settings.samples, worlds, 1, 1, generator=self._generator)
+        time = torch.arange(settings.horizon) / settings.knot
+        left = time.long().clamp(max=max(knots - 2, 0))
+        share = (time - left)[:, None]
+        ways = torch.lerp(at_knots[:, :, left], at_knots[:, :, (left + 1).clamp(max=knots - 1)], share)
+        plan = self._plan[:, : settings.horizon]
+        ways[: settings.samples // 2] += plan
+        ways[0], ways[1] = 0.0, plan
+        return ways
+
+    @torch.no_grad()
+    def _look_ahead(self, base: EgoPoseEnv) -> None:
+        settings, copies, problem = self.settings, self._base, self._base.problem
+        ways = self._ways()
+        self._copy(base.state_dict())
+        observation = self._env.transform(copies.observe())
+        worth = torch.zeros(copies.batch_size[0])
+        cost = torch.zeros_like(worth)
+        velocity, rate, kept = copies.physics.qvel.copy(), 1.0 / problem.humanoid.control_dt, 1.0
+        for step in range(settings.horizon):
+            observation = self._actor(observation)
+            observation["action"] = observation["action"] + ways[:, :, step].flatten(0, 1)
+            after = self._env.step(observation)["next"]
+            body, frame = problem.view(copies.body_state()), after["frame"].squeeze(-1)
+            followed = SimpleNamespace(**{name: rows.index_select(0, frame) for name, rows in self._followed.items()})
+            reward, _ = self._reward(body, followed, after["episode_step"].squeeze(-1))
+            low = (self._head_height[frame] - body.xpos[:, problem.humanoid.head, 2]).clamp(min=0.0)
+            acceleration = torch.from_numpy(np.abs(copies.physics.qvel - velocity).mean(1) * rate)
+            velocity = copies.physics.qvel.copy()
+            worth += kept * reward.float()
+            cost += kept * (settings.acceleration * acceleration + settings.head * low).float()
+            cost += _BROKEN * after["diverged"].squeeze(-1)
+            kept *= settings.discount
+            observation = after.exclude("reward", "action")
+        worth += kept * self._critic(observation)["state_value"].squeeze(-1)
+        worlds = torch.arange(ways.shape[1])
+        score, worth = ((rows).unflatten(0, ways.shape[:2]) for rows in (worth - cost, worth))
+        best = score.argmax(0)
+        self.value = worth[best, worlds]
+        self._plan[:, : settings.horizon] = ways[best, worlds]
+
+    def _copy(self, state: Mapping[str, Tensor]) -> None:
+        """Put every body's copies where the body is, in ``state`` of its environment."""
+        samples = self.settings.samples
+        own = self._base.state_dict()
+        own |= {name: state[name].repeat(samples) for name in _EPISODE}
+        own["physics.state"] = state["physics.state"].repeat(samples, 1)
+        self._base.load_state_dict(own)
+
+    def close(self) -> None:
+        """Stop the copies' physics."""
+        self._env.close()
+
+
+def planner_settings(values: Mapping[str, Any] | None) -> PlannerSettings | None:
+    """Settings of a resolved ``conf/planner``; None where there is none.
+
+    Raises:
+        InputError: a value is missing, unknown or wrong.
+    """
+    from egopose.config import from_mapping
+
+    if values is None:
+        return None
+    joints: Sequence[str] = values.get("joints") or ()
+    return from_mapping(PlannerSettings, {**values, "joints": tuple(joints)}, "conf/planner")
