@@ -100,10 +100,10 @@ class Planner:
         problem, humanoid = base.problem, base.problem.humanoid
         if problem.action.kind != "pd":
             raise InputError(
-                "planner", "action", "a planner moves targets of PD controllers, not torques: planner=null"
+                "planner", "action", "a planner moves targets of PD controllers, not torques: planner=none"
             )
         if any(isinstance(part, RecurrentStates) for part in env.transform):
-            raise InputError("planner", "model.memory", "a planner's ways begin without a memory: planner=null")
+            raise InputError("planner", "model.memory", "a planner's ways begin without a memory: planner=none")
         self.settings, self._env, self._base, self._actor, self._critic = settings, env, base, actor, critic
         self._reward: Reward = build_reward(settings.reward)
         env.reset()
@@ -211,14 +211,14 @@ class Planner:
 
 
 def planner_settings(values: Mapping[str, Any] | None) -> PlannerSettings | None:
-    """Settings of a resolved ``conf/planner``; None where there is none.
+    """Settings of a resolved ``conf/planner``; None for its file ``none``, or where there is none.
 
     Raises:
         InputError: a value is missing, unknown or wrong.
     """
     from egopose.config import from_mapping
 
-    if values is None:
+    if not values:
         return None
     joints: Sequence[str] = values.get("joints") or ()
     return from_mapping(PlannerSettings, {**values, "joints": tuple(joints)}, "conf/planner")

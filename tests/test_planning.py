@@ -1,0 +1,351 @@
+"""Looking ahead: the body stays up longer, values are what a plain simulation gives, and nothing else is touched."""
+
+from __future__ import annotations
+
+from functools import cache
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from env_stand_in import environment, group
+from humanoid_stand_in import StandIn, reference_motion, stand_in
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModule
+from torch import Tensor
+from torchrl.envs import Compose, TransformedEnv
+
+from egopose.config import compose_config
+from egopose.envs.build import build_problem
+from egopose.envs.env import EgoPoseEnv
+from egopose.envs.forecasting import RecurrentStates
+from egopose.envs.mdp.observations import humanoid_state
+from egopose.envs.starts import Piece
+from egopose.envs.transforms import StateNormalizer
+from egopose.errors import InputError
+from egopose.estimate import allowed_planner
+from egopose.evaluation.agents import estimate_and_judge
+from egopose.inference.estimator import Estimate, estimate_takes
+from egopose.inference.failsafe import FailSafe, FailSafeSettings
+from egopose.inference.planning import Planner, PlannerSettings, planner_settings
+
+FRAMES = 60
+PIECES = (Piece(0, 0, FRAMES), Piece(1, 0, FRAMES))
+SMALL = {"samples": 12, "horizon": 8, "every": 8, "knot": 3, "acceleration": 0.001}
+humanoid = cache(stand_in)
+
+
+def settings(**changed: Any) -> PlannerSettings:
+    """``conf/planner/ahead.yaml`` but for what is given."""
+    made = planner_settings({**compose_config("evaluate", ["checkpoint=none"])["planner"], **changed})
+    assert made is not None
+    return made
+
+
+@cache
+def true_motion() -> tuple[TensorDict, Any]:
+    return reference_motion(humanoid(), (FRAMES, FRAMES))
+
+
+def other_motion() -> TensorDict:
+    """Each take backwards: body states, but of other frames."""
+    reference, _ = true_motion()
+    return torch.cat([take.flip(0) for take in reference.split(FRAMES)])
+
+
+def states_of(reference: TensorDict) -> Tensor:
+    return humanoid_state(reference).float()
+
+
+def make_env(worlds: int, reference: TensorDict | None = None, threads: int = 1, **action: Any) -> TransformedEnv:
+    known, takes = true_motion()
+    task = group("task", "estimation")
+    task = task | {"termination": {"enabled": False, "head_drop": 0.1}, "action": task["action"] | action}
+    body: StandIn = humanoid()
+    problem = build_problem(body, known if reference is None else reference, takes, task, group("reward", "estimation"))
+    base = environment(worlds, problem=problem, fragments=PIECES, whole_fragments=True, threads=threads)
+    return TransformedEnv(base, Compose(StateNormalizer(base.observation_spec["humanoid_state"].shape[-1])))
+
+
+def base_of(env: TransformedEnv) -> EgoPoseEnv:
+    assert isinstance(env.base_env, EgoPoseEnv)
+    return env.base_env
+
+
+def frozen(env: TransformedEnv) -> TransformedEnv:
+    env.transform[0].freeze()
+    return env
+
+
+def actor() -> TensorDictModule:
+    """A policy that reacts to the state, a little."""
+    size = humanoid().mj_model.nu
+    return TensorDictModule(lambda z: 0.05 * torch.sin(z[:, :size]), in_keys=["humanoid_state"], out_keys=["action"])
+
+
+def passive() -> TensorDictModule:
+    size = humanoid().mj_model.nu
+    return TensorDictModule(lambda z: torch.zeros(len(z), size), in_keys=["humanoid_state"], out_keys=["action"])
+
+
+def critic() -> TensorDictModule:
+    return TensorDictModule(lambda z: 2.0 + z[:, :1], in_keys=["humanoid_state"], out_keys=["state_value"])
+
+
+def planner_for(
+    worlds: int,
+    states: Tensor,
+    policy: TensorDictModule | None = None,
+    env: dict[str, Any] | None = None,
+    **changed: Any,
+) -> Planner:
+    chosen = settings(**{**SMALL, **changed})
+    copies = frozen(make_env(worlds * chosen.samples, **(env or {})))
+    return Planner(copies, policy or actor(), critic(), states, chosen)
+
+
+def leaning(env: TransformedEnv, steps: int = 3) -> EgoPoseEnv:
+    """Bodies some frames after their start, not where the reference has them."""
+    frozen(env).reset()
+    base, generator = base_of(env), torch.Generator().manual_seed(1)
+    for _ in range(steps):
+        action = 0.2 * torch.randn(base.batch_size[0], humanoid().mj_model.nu, generator=generator)
+        env.step(TensorDict({"action": action}, base.batch_size))
+    return base
+
+
+def simulated(base: EgoPoseEnv, way: Tensor, followed: TensorDict, chosen: PlannerSettings) -> tuple[Tensor, Tensor]:
+    """What ``way [N, H, nu]`` is worth from where ``base`` is, and the score it is chosen by, one step after another.
+
+    The motion that is followed is the reference here, so the environment's own reward and heads are the planner's.
+    """
+    env = frozen(make_env(base.batch_size[0], followed))
+    env.reset()
+    here = base_of(env)
+    here.load_state_dict(base.state_dict())
+    observation, worth, cost = env.transform(here.observe()), 0.0, 0.0
+    for step in range(way.shape[1]):
+        before = here.body_state()["qvel"]
+        observation = actor()(observation)
+        observation["action"] = observation["action"] + way[:, step]
+        after = env.step(observation)["next"]
+        body, frame = here.body_state(), after["frame"].squeeze(-1)
+        head = humanoid().head
+        low = (followed["xpos"][frame, head, 2] - body["xpos"][:, head, 2]).clamp(min=0)
+        change = 30.0 * (body["qvel"] - before).abs().mean(1)
+        worth = worth + chosen.discount**step * after["reward"].squeeze(-1)
+        cost = cost + chosen.discount**step * (chosen.acceleration * change + chosen.head * low)
+        observation = after.exclude("reward", "action")
+    worth = worth + chosen.discount ** way.shape[1] * critic()(observation)["state_value"].squeeze(-1)
+    env.close()
+    return worth, worth - cost
+
+
+def whole_way(planner: Planner, base: EgoPoseEnv) -> Tensor:
+    """The way that was chosen, ``[N, H, nu]``: a planner that plans once in a horizon gives it out step by step."""
+    assert planner.settings.every == planner.settings.horizon
+    return torch.stack([planner.addition(base) for _ in range(planner.settings.horizon)], dim=1)
+
+
+def run(planner: Planner | None, states: Tensor, policy: TensorDictModule) -> list[Estimate]:
+    guard = FailSafe(len(PIECES), FailSafeSettings("off", kappa=0.6, fallen_height=0.3))
+    return estimate_takes(make_env(len(PIECES)), policy, critic(), states, guard, planner=planner)
+
+
+def test_a_body_that_falls_alone_stays_up_longer() -> None:
+    states = states_of(true_motion()[0])
+    alone = run(None, states, passive())
+    planner = planner_for(2, states, passive(), samples=32, horizon=16, every=4, knot=5)
+    ahead = run(planner, states, passive())
+    for one, other in zip(alone, ahead, strict=True):
+        np.testing.assert_array_equal(one.qpos[0], other.qpos[0])
+        assert one.fallen.any()
+        upright = np.argmax(other.fallen) if other.fallen.any() else FRAMES
+        assert upright > 1.3 * np.argmax(one.fallen)
+
+
+def test_the_value_is_what_a_plain_simulation_of_the_chosen_way_is_worth() -> None:
+    followed = other_motion()
+    base = leaning(make_env(2))
+    planner = planner_for(2, states_of(followed))
+    worth, score = simulated(base, whole_way(planner, base), followed, planner.settings)
+    torch.testing.assert_close(planner.value, worth.float(), rtol=0, atol=1e-4)
+    nothing = torch.zeros(2, planner.settings.horizon, humanoid().mj_model.nu)
+    policy_alone = simulated(base, nothing, followed, planner.settings)
+    assert (score >= policy_alone[1] - 1e-4).all()
+    assert (score > policy_alone[1] + 1e-2).any()  # or there was nothing to choose between
+
+
+def test_without_a_better_way_the_policy_goes_on_alone() -> None:
+    """Ways that shake are never worth it where acceleration costs a lot."""
+    followed = other_motion()
+    base = leaning(make_env(2))
+    planner = planner_for(2, states_of(followed), acceleration=1e3, deviation=1.0)
+    assert not whole_way(planner, base).any()
+    nothing = torch.zeros(2, planner.settings.horizon, humanoid().mj_model.nu)
+    worth, _ = simulated(base, nothing, followed, planner.settings)
+    torch.testing.assert_close(planner.value, worth.float(), rtol=0, atol=1e-4)
+
+
+def test_only_what_balances_is_added_to_and_smoothly() -> None:
+    base = leaning(make_env(2))
+    planner = planner_for(2, states_of(true_motion()[0]), joints=["Leg"], knot=4, horizon=9, every=9)
+    way = whole_way(planner, base)
+    names = [joint.name for joint in humanoid().skeleton.joints for _ in joint.dofs]
+    legs = torch.tensor(["Leg" in name for name in names])
+    assert way[..., legs].any()
+    assert not way[..., ~legs].any()
+    bends = way[:, 2:] - 2 * way[:, 1:-1] + way[:, :-2]
+    at_knot = torch.tensor([step % 4 == 3 for step in range(bends.shape[1])])
+    torch.testing.assert_close(bends[:, ~at_knot], torch.zeros_like(bends[:, ~at_knot]), rtol=0, atol=1e-6)
+    assert bends[:, at_knot].abs().max() > 1e-3
+
+
+def test_planning_touches_nothing_of_the_body_it_is_for() -> None:
+    base = leaning(make_env(2))
+    planner = planner_for(2, states_of(other_motion()))
+    before = {name: value.clone() for name, value in base.state_dict().items()}
+    planner.addition(base)
+    after = base.state_dict()
+    assert before.keys() == after.keys()
+    assert all(torch.equal(value, after[name]) for name, value in before.items())
+
+
+def test_the_same_seed_gives_the_same_estimate_whatever_the_threads() -> None:
+    states = states_of(other_motion())
+    one, two, other = (
+        run(planner_for(2, states, env={"threads": threads}, every=4, seed=seed), states, actor())
+        for threads, seed in ((1, 3), (2, 3), (1, 4))
+    )
+    for a, b, c in zip(one, two, other, strict=True):
+        for name in ("qpos", "value", "confidence"):
+            np.testing.assert_array_equal(getattr(a, name), getattr(b, name))
+        assert not np.array_equal(a.qpos, c.qpos)
+
+
+def test_the_true_motion_plays_no_part() -> None:
+    true, states = true_motion()[0], states_of(other_motion())
+    altered = torch.cat([torch.cat([take[:1], take[1:].flip(0)]) for take in true.split(FRAMES)])
+    additions = []
+    for reference in (true, altered):
+        base = leaning(make_env(2, reference))
+        planner = planner_for(2, states, env={"reference": reference})
+        additions.append((whole_way(planner, base), planner.value))
+    assert not torch.equal(true["qpos"], altered["qpos"])
+    for one, two in zip(*additions, strict=True):
+        assert torch.equal(one, two)
+
+
+def test_a_body_that_was_placed_elsewhere_is_planned_for_at_once() -> None:
+    followed = other_motion()
+    states, base = states_of(followed), leaning(make_env(2))
+    planner = planner_for(2, states)
+    first = planner.addition(base)
+    value = planner.value.clone()
+    moved = base.body_state()["qpos"]
+    moved[:, 9] += 0.4
+    base.place(torch.arange(2), moved, torch.zeros(2, humanoid().mj_model.nv, dtype=torch.float64))
+    planner.addition(base)
+    assert torch.equal(planner.value, value)  # the plan goes on
+    planner.forget(torch.tensor([0, 1]))
+    way = whole_way(planner, base)
+    assert not torch.equal(way[:, 0], first)
+    worth, _ = simulated(base, way, followed, planner.settings)
+    torch.testing.assert_close(planner.value, worth.float(), rtol=0, atol=1e-4)
+
+
+def test_a_restart_by_the_fail_safe_is_planned_for() -> None:
+    """The estimator tells the planner: the frame after a restart has a value of its own, between plans or not."""
+    states = states_of(true_motion()[0])
+    planner = planner_for(2, states, every=8)
+    told: list[list[int]] = []
+    forget = planner.forget
+    planner.forget = lambda worlds: (told.append(worlds.tolist()), forget(worlds))[1]  # type: ignore[method-assign]
+    guard = FailSafe(2, FailSafeSettings("naive", kappa=0.6, fallen_height=1.4))  # higher than any head here
+    estimates = estimate_takes(make_env(2), actor(), critic(), states, guard, planner=planner)
+    resets = [np.flatnonzero(one.resets) for one in estimates]
+    assert len(resets[0])
+    assert len(told) == len({int(frame) for rows in resets for frame in rows})
+    assert all(
+        one.value[frame] != one.value[frame - 1] for one, rows in zip(estimates, resets, strict=True) for frame in rows
+    )
+
+
+@pytest.mark.parametrize(
+    ("changed", "field"),
+    [
+        ({"samples": 1}, "samples"),
+        ({"horizon": 3}, "every"),
+        ({"every": 0}, "every"),
+        ({"knot": 0}, "knot"),
+        ({"deviation": 0.0}, "deviation"),
+        ({"acceleration": -1.0}, "acceleration"),
+        ({"head": -1.0}, "head"),
+        ({"discount": 0.0}, "discount"),
+        ({"discount": 1.1}, "discount"),
+        ({"reward": None}, "reward"),
+        ({"reward": {"kind": "world_frame"}}, "reward"),
+        ({"horizon": "far"}, "horizon"),
+        ({"speed": 3}, "speed"),
+    ],
+)
+def test_a_bad_setting_is_named(changed: dict[str, Any], field: str) -> None:
+    with pytest.raises(InputError, match=field):
+        settings(**changed)
+
+
+def test_what_cannot_be_planned_for_is_refused() -> None:
+    states = states_of(true_motion()[0])
+    with pytest.raises(InputError, match="action") as refused:
+        planner_for(2, states, env={"kind": "torque"})
+    assert "planner=none" in str(refused.value)
+    with pytest.raises(InputError, match=r"joints.*Tail"):
+        planner_for(2, states, joints=["Tail"])
+    env = make_env(12)
+    env.append_transform(RecurrentStates({"hidden": 4}))
+    with pytest.raises(InputError, match=r"model\.memory"):
+        Planner(env, actor(), critic(), states, settings(**SMALL))
+
+
+def estimated_by(planner: PlannerSettings | None) -> list[Estimate]:
+    """What an evaluation makes of both takes."""
+
+    def env_of(split: str, *, worlds: int, threads: int, whole_fragments: bool, falls_end: bool) -> TransformedEnv:
+        assert whole_fragments
+        assert not falls_end
+        return frozen(make_env(worlds, threads=threads))
+
+    states = states_of(other_motion())
+    agent: Any = SimpleNamespace(
+        make_env=env_of,
+        actor=actor(),
+        critic=critic(),
+        followed_states=lambda: states,
+        config={"algo": {"gamma": 0.99}},
+    )
+    failsafe = FailSafeSettings("off", kappa=0.6, fallen_height=0.3)
+    return estimate_and_judge(agent, 2, "test", failsafe, 1, None, planner)[0]
+
+
+def test_an_evaluation_plans_only_where_it_is_told_to() -> None:
+    states = states_of(other_motion())
+    for planned, by_hand in (
+        (None, run(None, states, actor())),
+        (settings(**SMALL), run(planner_for(2, states), states, actor())),
+    ):
+        for one, two in zip(estimated_by(planned), by_hand, strict=True):
+            np.testing.assert_array_equal(one.qpos, two.qpos)
+            np.testing.assert_array_equal(one.value, two.value)
+
+
+def test_estimates_plan_unless_they_are_causal_or_told_not_to() -> None:
+    chosen = compose_config("estimate", ["video=none", "checkpoint=none"])
+    assert allowed_planner(chosen) == settings()
+    assert allowed_planner({**chosen, "causal": True}) is None
+    assert allowed_planner({**chosen, "planner": None}) is None
+    with pytest.raises(InputError, match="samples"):  # a wrong setting is told even where it is not used
+        allowed_planner({**chosen, "causal": True, "planner": {**chosen["planner"], "samples": 0}})
+    for name, words in (("evaluate", []), ("estimate", ["video=none"])):
+        without = compose_config(name, ["checkpoint=none", "planner=none", *words])
+        assert planner_settings(without.get("planner")) is None
