@@ -13,6 +13,7 @@ VERBS = {
     "sync": "find the offset between a video and a motion, by how the head turns in both",
     "train": "train a policy (Hydra: group=choice key=value, --multirun)",
     "baseline": "train a method that policies are compared with: ERD, acLSTM, PathPose",
+    "limbs": "train what finds the wearer's limbs in the picture, on pictures it draws",
     "evaluate": "score a checkpoint on held-out takes beside PoseReg: tables, CSV, BVH, side-by-side MP4",
     "kappa": "choose the fail-safe's threshold for a run on its training takes",
     "estimate": "motion from a video alone: BVH and MP4",

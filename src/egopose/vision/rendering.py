@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from egopose.motion.rotations import Array, from_axis_angle, from_scipy, multiply, to_scipy
 from egopose.vision.corruption import Corruption
 from egopose.vision.gl import open_context
-from egopose.vision.rooms import Range, RoomConfig, draw_room, furnish
+from egopose.vision.rooms import Range, Room, RoomConfig, draw_room, furnish
 from egopose.vision.video import Frame, write_video
 
 WEARER_CAMERA = "head"
@@ -121,6 +121,29 @@ class SceneRenderer:
             ValueError: qpos is of another length; after :meth:`close`.
             KeyError: the model has no camera of that name.
         """
+        self._draw(qpos, camera)
+        return np.flipud(self._pixels).copy()
+
+    def segment(self, qpos: Array, camera: str | mujoco.MjvCamera) -> NDArray[np.int32]:
+        """Which geom each pixel of :meth:`render`'s picture shows: its id ``[height, width]``, -1 for none.
+
+        Raises as :meth:`render`.
+        """
+        flags = [int(mujoco.mjtRndFlag.mjRND_SEGMENT), int(mujoco.mjtRndFlag.mjRND_IDCOLOR)]
+        self._scene.flags[flags] = 1
+        try:
+            self._draw(qpos, camera)
+        finally:
+            self._scene.flags[flags] = 0
+        # A pixel's colour is 1 + the number of what it shows in the scene, which is not the geom's in the model.
+        shown = self._pixels.astype(np.int64) @ (1, 1 << 8, 1 << 16)
+        ids = np.full(self._scene.ngeom + 1, -1, np.int32)
+        for geom in self._scene.geoms[: self._scene.ngeom]:
+            if geom.objtype == mujoco.mjtObj.mjOBJ_GEOM and geom.segid >= 0:
+                ids[geom.segid + 1] = geom.objid
+        return np.flipud(ids[np.minimum(shown, len(ids) - 1)]).copy()
+
+    def _draw(self, qpos: Array, camera: str | mujoco.MjvCamera) -> None:
         if self._gl is None:
             raise ValueError("the renderer is closed")
         self.data.qpos[:] = qpos
@@ -138,7 +161,6 @@ class SceneRenderer:
         mujoco.mjv_updateScene(self.model, self.data, self._options, None, view, every, self._scene)
         mujoco.mjr_render(self._rect, self._scene, self._context)
         mujoco.mjr_readPixels(self._pixels, None, self._rect, self._context)
-        return np.flipud(self._pixels).copy()
 
 
 def camera_orientations(model: mujoco.MjModel, angles: Array) -> NDArray[np.float64]:
@@ -162,6 +184,23 @@ def camera_orientations(model: mujoco.MjModel, angles: Array) -> NDArray[np.floa
     head = data.xquat[model.cam_bodyid[camera]] * np.array([1.0, -1.0, -1.0, -1.0])
     fixed = multiply(multiply(head, heading), level)
     return multiply(multiply(multiply(np.broadcast_to(fixed, (len(angles), 4)), turns[0]), turns[1]), turns[2])
+
+
+def furnished_model(model_xml: str, room: Room, config: RoomConfig) -> mujoco.MjModel:
+    """The humanoid in a room, as its wearer sees it: dressed, the own head out of sight.
+
+    Raises:
+        ValueError: the model has no camera ``head``.
+    """
+    spec = mujoco.MjSpec.from_string(model_xml)
+    mount = spec.camera(WEARER_CAMERA)
+    if mount is None:
+        raise ValueError(f"the model has no camera {WEARER_CAMERA!r}")
+    furnish(spec, room, config)
+    for geom in mount.parent.geoms:
+        # Seen from inside, one's own head is nothing but an obstacle.
+        geom.material, geom.rgba = "", [0, 0, 0, 0]
+    return spec.compile()
 
 
 def wearer_frames(
@@ -194,15 +233,7 @@ def wearer_frames(
     """
     if len(qpos) == 0:
         raise ValueError("a motion without frames cannot be rendered")
-    spec = mujoco.MjSpec.from_string(model_xml)
-    mount = spec.camera(WEARER_CAMERA)
-    if mount is None:
-        raise ValueError(f"the model has no camera {WEARER_CAMERA!r}")
-    furnish(spec, draw_room(room_seed, qpos[:, :2], float(qpos[:, 2].max()) + _REACH, room), room)
-    for geom in mount.parent.geoms:
-        # Seen from inside, one's own head is nothing but an obstacle.
-        geom.material, geom.rgba = "", [0, 0, 0, 0]
-    model = spec.compile()
+    model = furnished_model(model_xml, draw_room(room_seed, qpos[:, :2], float(qpos[:, 2].max()) + _REACH, room), room)
     if qpos.shape[1] != model.nq:
         raise ValueError(f"qpos has {qpos.shape[1]} coordinates, the model {model.nq}")
     rng = np.random.default_rng([take_seed, 2])
