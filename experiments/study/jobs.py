@@ -26,6 +26,7 @@ from egopose.forecast_contexts import past_states
 from egopose.forecast_evaluation import ForecastSettings, forecast_windows_of, windows_of
 from egopose.inference.context_states import context_states
 from egopose.inference.failsafe import FailSafeSettings
+from egopose.inference.planning import planner_settings
 from egopose.material import Material, absolute_paths, load_material, run_material
 from egopose.models.baselines.path_pose import PathPose
 from egopose.models.baselines.recurrent import RecurrentForecaster
@@ -115,7 +116,9 @@ def _estimates(
         fragments = list(agent.material.test)
         labels = _labels(judged, fragments)
         failsafe = from_mapping(FailSafeSettings, settings["failsafe"], "conf/evaluate.yaml: failsafe")
-        found = evaluate_agent(agent, fragments, labels, "test", failsafe, contact, int(settings["threads"]))
+        planner = planner_settings(settings.get("planner"))
+        threads = int(settings["threads"])
+        found = evaluate_agent(agent, fragments, labels, "test", failsafe, contact, threads, planner=planner)
         diverged = sum(one.estimate.diverged for one in found)
         survival = {"survival": _survival(agent, settings)} if job.survival else {}
         return raw_figures([one.scores for one in found]) | {"diverged": int(diverged)} | survival

@@ -67,7 +67,7 @@ def seen_in(
     Args:
         humanoid: the run's.
         regressor: trained, in eval mode.
-        flow: ``[T, 2, S, S]`` of the video at the control rate.
+        flow: ``[T, 2, S, S]`` of the video at the control rate, with a third plane where the regressor sees limbs.
         made_with: the groups ``vision`` and ``regressor`` it was trained with.
 
     Returns:
@@ -264,6 +264,7 @@ def estimate_video(values: Mapping[str, Any]) -> Path:
     from egopose.data.preparation import humanoid_of
     from egopose.pipeline import load_agent
     from egopose.regression import load_regressor
+    from egopose.sight import load_finder_of
     from egopose.training.checkpoint import find_checkpoint, read_json
     from egopose.vision.features import extract_flow
     from egopose.vision.lens import Camera
@@ -278,7 +279,8 @@ def estimate_video(values: Mapping[str, Any]) -> Path:
     lookahead = allowed_lookahead(values)
     camera = Camera.from_mapping(values["camera"], "camera")
     rate, offset = 1.0 / humanoid.control_dt, float(values["offset"])
-    flow = extract_flow(video, made_with["vision"]["flow"], rate, offset, camera=camera)
+    finder = load_finder_of(made_with["regressor"])
+    flow = extract_flow(video, made_with["vision"]["flow"], rate, offset, camera=camera, finder=finder)
     overrides = None
     if lookahead is None:
         seen = seen_in(humanoid, regressor, flow, made_with)

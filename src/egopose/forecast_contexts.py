@@ -7,8 +7,8 @@ its own regressor through the context (Yuan & Kitani 2019, section 3.2: z_1 is f
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -29,7 +29,9 @@ from egopose.material import Material
 from egopose.motion.motion import finite_difference
 from egopose.motion.rotations import Array
 from egopose.regression import load_regressor
+from egopose.sight import seen_in_store
 from egopose.training.checkpoint import find_checkpoint, read_json
+from egopose.training.predictions import Flow
 
 if TYPE_CHECKING:
     from egopose.pipeline import Agent
@@ -70,12 +72,14 @@ def past_states(
         return _estimated(agent, first, context, estimator, failsafe, threads)
     if material.regressor is None:
         raise InputError(agent.path, "regressor", "forecasts begin from the state regressor's state, and there is none")
-    model, _ = load_regressor(material.regressor)
-    return context_states(model, _flow(agent), first, context).double()
+    model, made_with = load_regressor(material.regressor)
+    return context_states(model, _seen(agent, made_with), first, context).double()
 
 
-def _flow(agent: Agent) -> Tensor:
-    return TakeStore.open(store_folder(agent.config)).flow(flow_name(agent.config))
+def _seen(agent: Agent, made_with: Mapping[str, Any]) -> Flow:
+    """What a regressor looks at of the store the agent was trained on."""
+    config = agent.config
+    return seen_in_store(config, made_with["regressor"], TakeStore.open(store_folder(config)), flow_name(config))
 
 
 def _estimated(
@@ -86,7 +90,7 @@ def _estimated(
     checkpoint = find_checkpoint(estimator)
     require_estimation(read_json(checkpoint, "config"), checkpoint)
     model, made_with = load_regressor(run_folder(checkpoint) / "regressor")
-    flow, humanoid = _flow(agent), agent.material.humanoid
+    flow, humanoid = _seen(agent, made_with), agent.material.humanoid
     found = [seen_in(humanoid, model, np.asarray(flow[at : at + context]), made_with) for at in first]
     seen = {key: torch.cat([clip[key] for clip in found]) for key in found[0]}
     material = context_material(agent.material, first, context, seen)

@@ -33,10 +33,11 @@ from egopose.models.blended import blended_regressor
 from egopose.models.kernel_regression import KernelRegression
 from egopose.models.mirror import state_mirror
 from egopose.models.regressor import StateRegressor
+from egopose.sight import finder_fingerprint, finder_of, seen_in_store
 from egopose.training.blending import KernelSettings, blend
 from egopose.training.checkpoint import CHECKSUMS, ComponentState, RunCheckpoint, metadata_of, read_json, verify
 from egopose.training.fragments import Span, cross_fit_blocks, group_blocks, without_block
-from egopose.training.predictions import predict_takes
+from egopose.training.predictions import Flow, predict_takes
 from egopose.training.regressor_settings import RegressorSettings
 from egopose.training.supervised import Progress, State, TrainingResult, build_regressor, train_regressor
 from egopose.untrusted import read_json as read_json_file
@@ -50,6 +51,9 @@ def regressor_name(config: Mapping[str, Any], store: TakeStore, flow_name: str) 
     parts = [store.fingerprint, flow_name, config["vision"]["encoder"], config["regressor"], config["data"]["split"]]
     if _by_subject(config):
         parts.append("cross-fitted by subject")
+    finder = finder_of(config["regressor"])
+    if finder is not None:
+        parts.append(finder_fingerprint(finder))
     return "regressor-" + hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()[:12]
 
 
@@ -115,7 +119,8 @@ def kept_tables(
     if made_with["state_size"] != size:
         raise InputError(weights, "state_size", f"is {made_with['state_size']}, the store's states have {size} numbers")
     print(f"predicting {store.frames_total} frames with {weights}", file=sys.stderr, flush=True)
-    return TensorDict(_predict(model, store, humanoid, flow_name, _settings(made_with)), [store.frames_total]), weights
+    seen = seen_in_store(config, made_with["regressor"], store, flow_name)
+    return TensorDict(_predict(model, store, humanoid, seen, _settings(made_with)), [store.frames_total]), weights
 
 
 def _network_config(config: Mapping[str, Any]) -> dict[str, Any] | None:
@@ -145,9 +150,9 @@ def _weights_checksums(folder: Path) -> dict[str, str]:
 
 
 def _predict(
-    model: StateRegressor, store: TakeStore, humanoid: HumanoidModel, flow_name: str, settings: RegressorSettings
+    model: StateRegressor, store: TakeStore, humanoid: HumanoidModel, seen: Flow, settings: RegressorSettings
 ) -> dict[str, Tensor]:
-    tables = predict_takes(model, store.flow(flow_name), _whole_takes(store), settings)
+    tables = predict_takes(model, seen, _whole_takes(store), settings)
     return _with_targets(model, tables, humanoid, settings)
 
 
@@ -187,11 +192,11 @@ def _train(
         )
 
     model, result = fit(fragments, "")
-    tables = _predict(model, store, humanoid, flow_name, settings)
+    tables = _predict(model, store, humanoid, flow, settings)
     if settings.cross_fit > 1:
         for number, block in enumerate(_blocks(config, store)):
             others = without_block(fragments, block, settings.margin, settings.margin)
-            seen = _predict(fit(others, f".fold{number}")[0], store, humanoid, flow_name, settings)
+            seen = _predict(fit(others, f".fold{number}")[0], store, humanoid, flow, settings)
             for key in ("humanoid_state", "visual_features", "joint_targets"):
                 for span in block:
                     tables[key][span.start : span.stop] = seen[key][span.start : span.stop]
@@ -257,11 +262,12 @@ def _blend(
     settings = _settings(config)
     network_name = regressor_name(network_config, store, flow_name)
     network, made_with = load_regressor(store.root / "regressors" / network_name)
+    seen = seen_in_store(config, config["regressor"], store, flow_name, keep=True)
     print(f"blending a kernel regression with {network_name}", file=sys.stderr, flush=True)
     blended = blend(
         network,
         store.table(network_name)["humanoid_state"],
-        store.flow(flow_name),
+        seen,
         humanoid_state(store.reference),
         _whole_takes(store),
         _training_spans(config, store),
@@ -271,7 +277,7 @@ def _blend(
         _kernel_settings(config),
     )
     print(f"shares of network and kernel: {blended.shares}", file=sys.stderr, flush=True)
-    tables = _predict(blended.model, store, humanoid, flow_name, settings)
+    tables = _predict(blended.model, store, humanoid, seen, settings)
     for span in _training_spans(config, store):
         tables["humanoid_state"][span.start : span.stop] = blended.crossed[span.start : span.stop]
     tables = _with_targets(blended.model, tables, humanoid, settings)
@@ -329,9 +335,9 @@ def load_regressor(weights: str | Path) -> tuple[StateRegressor, dict[str, Any]]
     if _network_config(config) is not None:
         kernel = _kernel_settings(config)
         windows = kernel.windows()
-        inputs = windows.count * FLOW_CHANNELS * kernel.cells**2
+        inputs = windows.count * (FLOW_CHANNELS * kernel.cells**2 + kernel.limb_numbers)
         blank = KernelRegression(inputs, int(config["axes"]), int(config["centres"]), size)
-        model = blended_regressor(model, blank, kernel.cells, windows)
+        model = blended_regressor(model, blank, kernel.cells, windows, kernel.limb_numbers)
     RunCheckpoint({"regressor": model}).restore(folder)
     return model.eval(), config
 

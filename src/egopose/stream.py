@@ -90,7 +90,7 @@ class Forecaster:
     Args:
         env: ``1 + drawn futures`` worlds, on a take of still frames.
         actor, regressor: in eval mode.
-        flow_size: S of the flow its encoder sees.
+        seen: planes and both sides of what its encoder sees of a frame.
         settings: of the stream's forecasts.
         curves: of a policy that follows kinematic forecasts.
     """
@@ -98,7 +98,7 @@ class Forecaster:
     env: TransformedEnv
     actor: TensorDictModuleBase
     regressor: StateRegressor
-    flow_size: int
+    seen: tuple[int, int, int]
     settings: ForecastSettings
     curves: ForecastCurves | None = None
 
@@ -127,6 +127,7 @@ def load_forecaster(values: Mapping[str, Any], trained: Trained) -> Forecaster |
     from egopose.motion_forecasts import ForecastCurves, still_futures
     from egopose.pipeline import load_agent
     from egopose.regression import load_regressor
+    from egopose.sight import finder_of, planes_of
     from egopose.training.checkpoint import find_checkpoint, read_json
 
     settings, checkpoint = forecast_settings(values), values["forecast"]["checkpoint"]
@@ -147,6 +148,9 @@ def load_forecaster(values: Mapping[str, Any], trained: Trained) -> Forecaster |
     flows = ({**dict(made["vision"]["flow"]), "workers": 1} for made in (made_with, trained.made_with))
     if len({tuple(sorted(flow.items())) for flow in flows}) > 1:
         raise InputError(folder, "vision.flow", "another flow than the estimating run's: train both with one vision")
+    if finder_of(made_with["regressor"]) != finder_of(trained.made_with["regressor"]):
+        cause = "another limb finder than the estimating run's: train both with one regressor"
+        raise InputError(folder, "regressor.kernel.limbs", cause)
     material = still_frames(humanoid, regressor, made_with, task["context"] + task["minimum"])
     curves = None
     if follows:
@@ -154,7 +158,9 @@ def load_forecaster(values: Mapping[str, Any], trained: Trained) -> Forecaster |
         curves = ForecastCurves(config, material, run_folder(folder))
     agent = load_agent(folder, material)
     env = agent.make_env("test", worlds=1 + settings.drawn, threads=1, whole_fragments=True, falls_end=False)
-    return Forecaster(env, agent.actor, regressor, int(made_with["vision"]["flow"]["stored_size"]), settings, curves)
+    size = int(made_with["vision"]["flow"]["stored_size"])
+    seen = (planes_of(made_with["regressor"]), size, size)
+    return Forecaster(env, agent.actor, regressor, seen, settings, curves)
 
 
 def still_frames(
@@ -164,9 +170,10 @@ def still_frames(
     import numpy as np
 
     from egopose.estimate import seen_in, video_material
+    from egopose.sight import planes_of
 
     size = int(made_with["vision"]["flow"]["stored_size"])
-    still = np.zeros((frames, 2, size, size), np.float16)
+    still = np.zeros((frames, planes_of(made_with["regressor"]), size, size), np.float16)
     return video_material(humanoid, seen_in(humanoid, regressor, still, made_with), "stream")[0]
 
 
@@ -187,6 +194,7 @@ def build_loop(
     from egopose.inference.stream.latency import LatencyTable
     from egopose.inference.stream.loop import STAGES, LiveLoop, LoopSettings
     from egopose.inference.stream.sight import Sight
+    from egopose.sight import load_finder_of
     from egopose.vision.flow import FlowConfig
     from egopose.vision.lens import Camera
 
@@ -207,7 +215,7 @@ def build_loop(
         """As at the start: nothing seen yet."""
         task, lookahead = trained.config["task"], values["lookahead"]
         return (
-            Sight(trained.regressor, flow, camera, rate),
+            Sight(trained.regressor, flow, camera, rate, load_finder_of(trained.made_with["regressor"])),
             causal_regression(trained.humanoid, trained.regressor, trained.made_with, task, lookahead),
             LiveBody(trained.env, trained.actor, trained.critic, failsafe, lap),
         )
@@ -234,8 +242,8 @@ def _forecasts(values: Mapping[str, Any], forecaster: Forecaster, fallen_height:
 
     made = forecaster
     futures = LiveFutures(made.env, made.actor, made.regressor, settings, fallen_height, made.curves)
-    size, humanoid = forecaster.flow_size, forecaster.env.base_env.problem.humanoid
-    still = np.zeros((futures.context, 2, size, size), np.float32)
+    humanoid = forecaster.env.base_env.problem.humanoid
+    still = np.zeros((futures.context, *forecaster.seen), np.float32)
     standing = humanoid.skeleton.rest_qpos()
     standing[2] = 1.0
     futures.roll(Moment(0, standing, np.zeros(humanoid.mj_model.nv), still, time.perf_counter()))

@@ -1,8 +1,9 @@
-"""The state regressor F beside a kernel regression on the same flow: ``share * F + share * kernel + rest * mean``.
+"""The state regressor F beside a kernel regression: ``share * F + share * kernel + rest * mean``.
 
 A blended F is a :class:`StateRegressor` of other parts, so that whatever takes an F takes it: its encoder gives the
-network's features and the flow's mean in a few cells, its context the network's context and what those cells saw in the
-half second around, its head mixes what the two make of it. Beyond Yuan & Kitani 2019, whose PoseReg it is not.
+network's features, the flow's mean in a few cells and what a limb finder makes of the picture, its context the
+network's context and what those others saw in the half second around, its head mixes what the two make of it. Beyond
+Yuan & Kitani 2019, whose PoseReg it is not.
 """
 
 from __future__ import annotations
@@ -24,22 +25,40 @@ def flow_cells(flow: Tensor, cells: int) -> Tensor:
     return functional.adaptive_avg_pool2d(flow.to(torch.float32), cells).flatten(1)
 
 
+def kernel_view(seen: Tensor, cells: int, limbs: int) -> Tensor:
+    """What the kernel looks at of each frame, ``[B, 2 cells^2 + limbs]`` float32.
+
+    Args:
+        seen: flow ``[B, 2, H, W]``, with a third plane where there are limbs (:func:`egopose.vision.limbs.as_plane`).
+        cells: see :func:`flow_cells`.
+        limbs: numbers of the third plane that count.
+
+    Raises:
+        ValueError: there is no third plane, or one too many.
+    """
+    if seen.shape[1] != FLOW_CHANNELS + bool(limbs):
+        planes = "flow and limbs" if limbs else "flow alone"
+        raise ValueError(f"this regressor looks at {planes}, got {list(seen.shape)}")
+    flow = flow_cells(seen[:, :FLOW_CHANNELS], cells)
+    return torch.cat([flow, seen[:, FLOW_CHANNELS:].flatten(1)[:, :limbs].to(torch.float32)], dim=1)
+
+
 class CellEncoder(nn.Module):
-    """A network's visual features and the flow's cells, side by side.
+    """A network's visual features and what the kernel looks at, side by side.
 
     Args:
         network: the encoder of F.
-        cells: see :func:`flow_cells`.
+        cells, limbs: see :func:`kernel_view`.
     """
 
-    def __init__(self, network: FlowEncoder, cells: int) -> None:
+    def __init__(self, network: FlowEncoder, cells: int, limbs: int = 0) -> None:
         super().__init__()
-        self.network, self.cells = network, cells
-        self.features = network.features + FLOW_CHANNELS * cells**2
+        self.network, self.cells, self.limbs = network, cells, limbs
+        self.features = network.features + FLOW_CHANNELS * cells**2 + limbs
 
-    def forward(self, flow: Tensor) -> Tensor:
-        """``[B, 2, H, W]`` -> ``[B, D + 2 cells^2]`` float32."""
-        return torch.cat([self.network(flow), flow_cells(flow, self.cells)], dim=1)
+    def forward(self, seen: Tensor) -> Tensor:
+        """``[B, 2 or 3, H, W]`` -> ``[B, D + 2 cells^2 + limbs]`` float32."""
+        return torch.cat([self.network(seen[:, :FLOW_CHANNELS]), kernel_view(seen, self.cells, self.limbs)], dim=1)
 
 
 class TimeWindows(nn.Module):
@@ -154,14 +173,14 @@ class BlendedHead(nn.Module):
 
 
 def blended_regressor(
-    network: StateRegressor, kernel: KernelRegression, cells: int, windows: TimeWindows
+    network: StateRegressor, kernel: KernelRegression, cells: int, windows: TimeWindows, limbs: int = 0
 ) -> StateRegressor:
     """F of ``network``'s parts and the kernel; the shares of its head are zero until they are set.
 
     Args:
         network: trained, with its encoder; its parts become those of the answer.
         kernel: of ``windows`` over ``cells``.
-        cells: see :func:`flow_cells`.
+        cells, limbs: see :func:`kernel_view`.
         windows: of time.
 
     Raises:
@@ -170,7 +189,8 @@ def blended_regressor(
     if not isinstance(network.encoder, FlowEncoder):
         raise ValueError("a regressor of flow is needed")
     size, own = len(network.state_mean), network.context.output_size
-    network.encoder = CellEncoder(network.encoder, cells)
-    network.context = BlendedContext(network.context, FLOW_CHANNELS * cells**2, windows)
+    size_seen = FLOW_CHANNELS * cells**2 + limbs
+    network.encoder = CellEncoder(network.encoder, cells, limbs)
+    network.context = BlendedContext(network.context, size_seen, windows)
     network.head = BlendedHead(network.head, kernel, own, size)
     return network.eval()

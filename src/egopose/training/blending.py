@@ -16,12 +16,13 @@ from torch import Tensor
 
 from egopose.errors import InputError
 from egopose.humanoid.model import HumanoidModel
-from egopose.models.blended import TimeWindows, blended_regressor, flow_cells
+from egopose.models.blended import TimeWindows, blended_regressor, kernel_view
 from egopose.models.kernel_regression import KernelRegression, fit_kernel_regression
 from egopose.models.regressor import StateRegressor
 from egopose.training.fragments import Span, without_block
 from egopose.training.predictions import Flow, take_frames, torch_threads
 from egopose.training.regressor_settings import RegressorSettings
+from egopose.vision.limbs import load_finder
 
 
 @dataclass(frozen=True)
@@ -34,6 +35,7 @@ class KernelSettings:
         axes, whitening, ridge, length, metric_rows: see :func:`fit_kernel_regression`.
         centres: moments of training remembered at most, evenly chosen.
         share_step: the shares are multiples of it.
+        limbs: the limb finder whose answers the kernel sees too, by its name in the package; None for flow alone.
     """
 
     cells: int
@@ -47,6 +49,7 @@ class KernelSettings:
     metric_rows: int
     centres: int
     share_step: float
+    limbs: str | None = None
 
     def __post_init__(self) -> None:
         def check(ok: bool, name: str, cause: str) -> None:
@@ -58,6 +61,11 @@ class KernelSettings:
         check(self.width > 0 and self.ridge > 0 and self.length > 0, "width", "must be positive, as must ridge, length")
         check(self.centres >= 2, "centres", "must be at least 2")
         check(0 < self.share_step <= 1, "share_step", "must lie in (0, 1]")
+
+    @property
+    def limb_numbers(self) -> int:
+        """Numbers of a frame that come from the limb finder."""
+        return 0 if self.limbs is None else 2 * load_finder(self.limbs).numbers
 
     def windows(self) -> TimeWindows:
         return TimeWindows(self.reach, self.step, self.width)
@@ -119,7 +127,9 @@ def blend(
             for span in block:
                 by_kernel[span.start : span.stop] = left_out(seen[span.start : span.stop])
         kernel = fit_kernel(seen, wanted, fragments, kernel_settings, importance)
-    model = blended_regressor(network, kernel, kernel_settings.cells, kernel_settings.windows())
+    model = blended_regressor(
+        network, kernel, kernel_settings.cells, kernel_settings.windows(), kernel_settings.limb_numbers
+    )
     frames = torch.cat([torch.arange(s.start, s.stop) for s in fragments])
     starts = torch.tensor([span.start for span in takes])
     take = torch.searchsorted(starts, frames, right=True) - 1
@@ -137,7 +147,7 @@ def window_table(flow: Flow, takes: Sequence[Span], settings: KernelSettings, ba
     """What the kernel sees of each frame, ``[F, V]`` float32; zero outside of ``takes``.
 
     Args:
-        flow: ``[F, 2, S, S]`` of the whole store.
+        flow: ``[F, 2, S, S]`` of the whole store, with a third plane where the kernel sees limbs.
         takes: each a clip by itself.
         settings: of the cells and windows.
         batch: frames read at a time.
@@ -146,7 +156,9 @@ def window_table(flow: Flow, takes: Sequence[Span], settings: KernelSettings, ba
     rows = torch.zeros(len(flow), 0)
     for span in takes:
         parts = [np.arange(at, min(at + batch, span.stop)) for at in range(span.start, span.stop, batch)]
-        cells = torch.cat([flow_cells(take_frames(flow, part), settings.cells) for part in parts])
+        cells = torch.cat(
+            [kernel_view(take_frames(flow, part), settings.cells, settings.limb_numbers) for part in parts]
+        )
         seen = windows(windows.pad(cells[None]))[0]
         if not rows.shape[1]:
             rows = torch.zeros(len(flow), seen.shape[1])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from os import PathLike
 from typing import Any
 
@@ -14,7 +14,8 @@ from torch import Tensor
 from egopose.vision.encoders import FlowEncoder
 from egopose.vision.flow import FlowConfig, flow_of_frames
 from egopose.vision.lens import Camera, undo_rolling_shutter
-from egopose.vision.video import iter_frames, probe_video
+from egopose.vision.limbs import LimbFinder, Picture, as_plane, limb_rows, small_picture
+from egopose.vision.video import Frame, iter_frames, probe_video
 
 
 def extract_flow(
@@ -24,8 +25,9 @@ def extract_flow(
     offset: float = 0.0,
     count: int | None = None,
     camera: Camera | None = None,
+    finder: LimbFinder | None = None,
 ) -> NDArray[np.float16]:
-    """Flow of a video in step with a motion.
+    """Flow of a video in step with a motion, and what a limb finder makes of its pictures.
 
     Args:
         path: any MP4.
@@ -34,22 +36,61 @@ def extract_flow(
         offset: sync offset (s): what the motion shows at t, the video shows at t + offset.
         count: frames of the motion; None takes the video to its end.
         camera: lens, shutter and rate of a real camera, to be undone.
+        finder: of limbs; None for flow alone.
 
     Returns:
-        ``[T, 2, S, S]`` float16, image widths per frame; frame t's is from t-1 to t, frame 0's is zero.
+        ``[T, 2, S, S]`` float16, image widths per frame; frame t's is from t-1 to t, frame 0's is zero. With a finder
+        ``[T, 3, S, S]``, see :func:`egopose.vision.limbs.as_plane`.
 
     Raises:
         InputError: the video cannot be read or does not cover the motion.
     """
     config = cfg if isinstance(cfg, FlowConfig) else FlowConfig(**dict(cfg))
+    frames = _frames(path, config, fps, offset, count, camera)
+    pictures: list[Picture] = []
+    if finder is not None:
+        frames = _remembered(frames, pictures)
+    flow = np.stack(list(flow_of_frames(frames, config)))
+    if camera is not None and camera.readout:
+        flow = undo_rolling_shutter(flow, camera.readout, 1.0 / fps)
+    if finder is None:
+        return flow
+    return np.concatenate([flow, as_plane(limb_rows(finder, pictures, flow), config.stored_size)], axis=1)
+
+
+def extract_limbs(
+    path: str | PathLike[str],
+    flow: NDArray[np.floating],
+    cfg: FlowConfig,
+    finder: LimbFinder,
+    fps: float,
+    offset: float,
+    camera: Camera | None,
+) -> NDArray[np.float16]:
+    """``[T, 2 Q]``, see :func:`egopose.vision.limbs.limb_rows`, of a video whose flow ``[T, 2, S, S]`` is there.
+
+    Other arguments, and errors, as of :func:`extract_flow`.
+    """
+    pictures = [small_picture(frame) for frame in _frames(path, cfg, fps, offset, len(flow), camera)]
+    return limb_rows(finder, pictures, flow)
+
+
+def _frames(
+    path: str | PathLike[str], config: FlowConfig, fps: float, offset: float, count: int | None, camera: Camera | None
+) -> Iterator[Frame]:
+    """Frames at the motion's times, without what the lens does to them."""
     if camera is None:
-        return np.stack(list(flow_of_frames(iter_frames(path, fps, offset, count), config)))
+        return iter_frames(path, fps, offset, count)
     info = probe_video(path)
     rectify = camera.rectifier(info.width, info.height, config.working_size)
     # The middle row, which stands for the frame, is exposed half a readout after its stamp.
-    frames = iter_frames(path, fps, offset - 0.5 * camera.readout, count, camera.fps)
-    flow = np.stack(list(flow_of_frames(map(rectify, frames), config)))
-    return undo_rolling_shutter(flow, camera.readout, 1.0 / fps) if camera.readout else flow
+    return map(rectify, iter_frames(path, fps, offset - 0.5 * camera.readout, count, camera.fps))
+
+
+def _remembered(frames: Iterator[Frame], pictures: list[Picture]) -> Iterator[Frame]:
+    for frame in frames:
+        pictures.append(small_picture(frame))
+        yield frame
 
 
 @torch.no_grad()
