@@ -6,6 +6,7 @@ rates: what coarser physics costs in tracking and energy, and what it saves.
 scaling: the cost of every part of an iteration, and the memory of workers that share the data.
 sync: how well the offset between a motion and its video is found.
 stream: live estimation: frames a second, latency by stage, late frames, memory.
+plan: looking ahead at test time beside the bare physics of it.
 resume: a training killed at random moments beside the same one left alone.
 export: what every export format loses, by independent readers.
 """
@@ -35,6 +36,7 @@ VERBS = {
     "export": 1,
     "sync": 8,
     "stream": 1,
+    "plan": 9,
 }
 
 

@@ -280,6 +280,18 @@ class EgoPoseEnv(EnvBase):
         stopped = self.physics.step(self._target(tensordict["action"], ALL), self._wrench(ALL))
         return TensorDict(self._arrived(stopped, ALL), batch_size=self.batch_size)
 
+    def try_step(self, action: Tensor) -> tuple[BodyView, dict[str, Tensor]]:
+        """A step that only looks what ``action [N, A]`` leads to: no reward, and no episode ends.
+
+        Returns:
+            The bodies, and the entries of their observations.
+        """
+        stopped = self.physics.step(self._target(action, ALL), self._wrench(ALL))
+        body = self.problem.view({k: torch.from_numpy(v) for k, v in self.physics.body_state().items()})
+        state = self.problem.observation(body).float()
+        diverged = torch.from_numpy(stopped[:, None])
+        return body, {**self._clock(), **self._no_flags, "diverged": diverged, "humanoid_state": state}
+
     def begin_step(self, action: Tensor, worlds: slice) -> None:
         """Have the physics' threads take a step of ``worlds``, a range, under ``action [n, A]``, while the caller works
         for others."""

@@ -8,26 +8,26 @@ What they are judged by is what the body follows, the state regressor's motion; 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import torch
-from tensordict import TensorDictBase
+from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBase
 from torch import Tensor
 from torchrl.envs import TransformedEnv
 
 from egopose.envs.env import EgoPoseEnv
 from egopose.envs.forecasting import RecurrentStates
 from egopose.envs.mdp.rewards import Reward, build_reward
+from egopose.envs.transformed import Entries, parts_of, run_parts
 from egopose.errors import InputError
 from egopose.models.pose_regression import state_to_qpos
 
-_EPISODE = ("take", "start", "stop", "frame")
+_EPISODE = ("take", "start", "stop", "frame")  # with one number for each body
 _BROKEN = 1000.0  # what a way loses whose physics break: more than any sum of rewards
-Controller = Callable[[TensorDictBase], TensorDictBase]
 
 
 @dataclass(frozen=True)
@@ -81,7 +81,8 @@ class Planner:
     Args:
         env: of ``N * samples`` worlds like those that are planned for, falls not ending an episode, its normaliser
             frozen.
-        actor, critic: policy and value network, in evaluation mode.
+        actor, critic: policy and value network, in evaluation mode; sequences of modules that read and write plain
+            entries.
         states: ``[F, 2 nq - 3]`` the regressor's humanoid state of every global frame, as the policy follows it.
         settings: see :class:`PlannerSettings`.
 
@@ -93,7 +94,12 @@ class Planner:
     """
 
     def __init__(
-        self, env: TransformedEnv, actor: Controller, critic: Controller, states: Tensor, settings: PlannerSettings
+        self,
+        env: TransformedEnv,
+        actor: TensorDictModuleBase,
+        critic: TensorDictModuleBase,
+        states: Tensor,
+        settings: PlannerSettings,
     ) -> None:
         base = env.base_env
         assert isinstance(base, EgoPoseEnv)
@@ -104,7 +110,11 @@ class Planner:
             )
         if any(isinstance(part, RecurrentStates) for part in env.transform):
             raise InputError("planner", "model.memory", "a planner's ways begin without a memory: planner=none")
-        self.settings, self._env, self._base, self._actor, self._critic = settings, env, base, actor, critic
+        self.settings, self._env, self._base = settings, env, base
+        # The mean is what a deterministic policy does: no need of the distribution behind it.
+        gaussian = isinstance(actor, ProbabilisticTensorDictSequential)
+        self._actor = [part for step in (actor.module[:-1] if gaussian else [actor]) for part in parts_of(step)]
+        self._action, self._critic = "loc" if gaussian else "action", parts_of(critic)
         self._reward: Reward = build_reward(settings.reward)
         env.reset()
         self._followed, self._head_height = self._what_is_followed(states)
@@ -171,26 +181,27 @@ class Planner:
         settings, copies, problem = self.settings, self._base, self._base.problem
         ways = self._ways()
         self._copy(base.state_dict())
-        observation = self._env.transform(copies.observe())
+        seen = Entries(self._env.transform(copies.observe()).items())
         worth = torch.zeros(copies.batch_size[0])
         cost = torch.zeros_like(worth)
         velocity, rate, kept = copies.physics.qvel.copy(), 1.0 / problem.humanoid.control_dt, 1.0
         for step in range(settings.horizon):
-            observation = self._actor(observation)
-            observation["action"] = observation["action"] + ways[:, :, step].flatten(0, 1)
-            after = self._env.step(observation)["next"]
-            body, frame = problem.view(copies.body_state()), after["frame"].squeeze(-1)
+            run_parts(self._actor, seen)
+            body, after = copies.try_step(seen[self._action] + ways[:, :, step].flatten(0, 1))
+            frame = after["frame"].squeeze(-1)
             followed = SimpleNamespace(**{name: rows.index_select(0, frame) for name, rows in self._followed.items()})
             reward, _ = self._reward(body, followed, after["episode_step"].squeeze(-1))
             low = (self._head_height[frame] - body.xpos[:, problem.humanoid.head, 2]).clamp(min=0.0)
-            acceleration = torch.from_numpy(np.abs(copies.physics.qvel - velocity).mean(1) * rate)
-            velocity = copies.physics.qvel.copy()
+            now = body.qvel.numpy()
+            acceleration = torch.from_numpy(np.abs(now - velocity).mean(1) * rate)
+            velocity = now
             worth += kept * reward.float()
             cost += kept * (settings.acceleration * acceleration + settings.head * low).float()
             cost += _BROKEN * after["diverged"].squeeze(-1)
             kept *= settings.discount
-            observation = after.exclude("reward", "action")
-        worth += kept * self._critic(observation)["state_value"].squeeze(-1)
+            seen = self._env.transform._step(seen, Entries(after))
+        run_parts(self._critic, seen)
+        worth += kept * seen["state_value"].squeeze(-1)
         worlds = torch.arange(ways.shape[1])
         score, worth = ((rows).unflatten(0, ways.shape[:2]) for rows in (worth - cost, worth))
         best = score.argmax(0)
@@ -202,7 +213,7 @@ class Planner:
         samples = self.settings.samples
         own = self._base.state_dict()
         own |= {name: state[name].repeat(samples) for name in _EPISODE}
-        own["physics.state"] = state["physics.state"].repeat(samples, 1)
+        own |= {name: state[name].repeat(samples, 1) for name in ("physics.state", "placed") if name in state}
         self._base.load_state_dict(own)
 
     def close(self) -> None:

@@ -11,12 +11,11 @@ from tensordict.nn import (
     ProbabilisticTensorDictSequential,
     TensorDictModule,
     TensorDictModuleBase,
-    TensorDictSequential,
 )
 from torchrl.envs import EnvBase
 from torchrl.modules import IndependentNormal
 
-from egopose.envs.transformed import TransformedEgoPoseEnv
+from egopose.envs.transformed import TransformedEgoPoseEnv, parts_of, run_parts
 
 
 class GaussianSampler(TensorDictModuleBase):
@@ -32,7 +31,7 @@ class GaussianSampler(TensorDictModuleBase):
         super().__init__()
         self.actor = actor
         self._network = actor.module[:-1]
-        self._parts = [part for step in self._network for part in _parts(step)]
+        self._parts = [part for step in self._network for part in parts_of(step)]
         self.in_keys = actor.in_keys
         self.out_keys = [key for key in actor.out_keys if key != "action_log_prob"]
 
@@ -51,17 +50,8 @@ class GaussianSampler(TensorDictModuleBase):
 
     def act(self, entries: MutableMapping[Any, Any]) -> None:
         """:meth:`forward` on a plain mapping, at a third of its expense."""
-        for part in self._parts:
-            out = part.module(*[entries[key] for key in part.in_keys])
-            entries.update(zip(part.out_keys, out if isinstance(out, tuple) else (out,), strict=True))
+        run_parts(self._parts, entries)
         entries["action"] = torch.normal(entries["loc"], entries["scale"])
-
-
-def _parts(module: TensorDictModuleBase) -> list[TensorDictModuleBase]:
-    """The modules of a sequence in order, those of sequences inside it too."""
-    if isinstance(module, TensorDictSequential):
-        return [part for inner in module.module for part in _parts(inner)]
-    return [module]
 
 
 def draws_gaussian(policy: TensorDictModuleBase) -> bool:

@@ -1,0 +1,78 @@
+"""Looking ahead beside the bare physics of the ways it tries."""
+
+from __future__ import annotations
+
+import statistics
+import time
+from collections.abc import Sequence
+from typing import Any
+
+
+def run(overrides: Sequence[str], rounds: int) -> dict[str, Any]:
+    """Plans of ``conf/planner/ahead.yaml`` for one body, then the same control steps by ``mj_step`` alone.
+
+    On the default clips, with untrained networks: what they cost does not depend on their weights' values.
+
+    Args:
+        overrides: of the training configuration (``sim=fast model=paper``); ``planner.KEY=VALUE`` of the planner.
+        rounds: of a second of frames each, interleaved; the median counts.
+
+    Returns:
+        ``plan_ms`` a frame, ``physics_ms`` of its control steps alone, ``ratio`` (the median round's), ``cpu_ratio``
+        (of the processor's time, which other programs disturb less), ``control_steps`` a frame, ``substeps``,
+        ``threads``, ``rounds``.
+
+    Raises:
+        InputError: a setting is unknown or out of range, or is for no planner.
+    """
+    import torch
+
+    from egopose import pipeline
+    from egopose.envs.benchmark import RawReplay, StepRecorder
+    from egopose.envs.mdp.observations import humanoid_state
+    from egopose.inference.estimator import prepare_for_test
+    from egopose.inference.planning import Planner, planner_settings
+
+    ours = [word for word in overrides if word.startswith("planner.")]
+    config = pipeline.compose_config("train", ["sim=fast", *(word for word in overrides if word not in ours)])
+    settings = planner_settings(pipeline.compose_config("evaluate", ["checkpoint=none", *ours])["planner"])
+    assert settings is not None  # the default is a planner, and only its values change here
+    threads = int(config["collector"]["physics_threads"])
+    torch.set_num_threads(1)
+    material = pipeline.motion_material(config)
+    options = {"threads": threads, "whole_fragments": True, "falls_end": False}
+    env = pipeline.build_env(config, material, worlds=1, **options)
+    copies = pipeline.build_env(config, material, worlds=settings.samples, **options)
+    actor, critic = pipeline.build_networks(config, material, env)
+    for one in (env, copies):
+        prepare_for_test(one, actor, critic)
+    env.reset()
+    states = humanoid_state(material.reference).float()
+    planner = Planner(copies, actor, critic, states, settings)
+    base, physics = env.base_env, copies.base_env.physics
+    recorder, replay = StepRecorder(physics), RawReplay(physics)
+
+    frames = -(-30 // settings.every) * settings.every  # a second's, in whole plans
+    planned, bare, ratios, cpu_ratios = [], [], [], []
+    for _ in range(rounds + 1):
+        recorder.clear()
+        began, cpu = time.perf_counter(), time.process_time()
+        for _ in range(frames):
+            planner.addition(base)
+        between, cpu_between = time.perf_counter(), time.process_time()
+        seconds = replay.run(recorder.states, recorder.ctrls)
+        planned.append(1e3 * (between - began) / frames)
+        bare.append(1e3 * seconds / frames)
+        ratios.append((between - began) / seconds)
+        cpu_ratios.append((cpu_between - cpu) / (time.process_time() - cpu_between))
+    replay.close()
+    env.close()
+    planner.close()
+    columns = {"plan_ms": planned, "physics_ms": bare, "ratio": ratios, "cpu_ratio": cpu_ratios}
+    return {
+        **{name: statistics.median(column[1:]) for name, column in columns.items()},  # the first round warms up
+        "control_steps": settings.samples * settings.horizon / settings.every,
+        "substeps": physics.substeps,
+        "threads": threads,
+        "rounds": rounds,
+    }
