@@ -30,6 +30,7 @@ from egopose.evaluation.agents import evaluate_agent  # noqa: E402
 from egopose.evaluation.protocols import ContactSettings, fragment_names, raw_figures  # noqa: E402
 from egopose.evaluation.tables import write_json  # noqa: E402
 from egopose.inference.failsafe import FailSafeSettings  # noqa: E402
+from egopose.inference.planning import planner_settings  # noqa: E402
 from egopose.material import run_material  # noqa: E402
 from egopose.models.baselines.path_pose import PathPose  # noqa: E402
 from egopose.pipeline import load_agent  # noqa: E402
@@ -56,6 +57,11 @@ def method_of(config: Mapping[str, Any]) -> str:
     return "vgail" if "discriminator" in config["algo"] else "ours"
 
 
+def planner_of(config: Mapping[str, Any]) -> Any:
+    """How a run's body looks ahead, as in `egopose evaluate`; VGAIL's torques cannot be planned for."""
+    return compose_config("evaluate", ["checkpoint=none"])["planner"] if method_of(config) == "ours" else None
+
+
 def judge(run: Path, config: Mapping[str, Any], corruption: Mapping[str, Any]) -> dict[str, Result]:
     """Figures by method on the test fragments, seen through ``corruption`` (a group of conf/corruption)."""
     settings = compose_config("evaluate", ["checkpoint=none"])
@@ -68,7 +74,8 @@ def judge(run: Path, config: Mapping[str, Any], corruption: Mapping[str, Any]) -
     fragments = list(agent.material.test)
     labels = _labels(agent.config, fragments)
     failsafe = from_mapping(FailSafeSettings, settings["failsafe"], "conf/evaluate.yaml: failsafe")
-    found = evaluate_agent(agent, fragments, labels, "test", failsafe, contact, int(settings["threads"]))
+    planner, threads = planner_settings(planner_of(config)), int(settings["threads"])
+    found = evaluate_agent(agent, fragments, labels, "test", failsafe, contact, threads, planner=planner)
     return {
         method_of(config): raw_figures([one.scores for one in found]),
         "posereg": raw_figures([one.pose_regression_scores for one in found]),
@@ -105,13 +112,14 @@ def judge_all(runs: Sequence[Path], corruptions: Sequence[str], results: Path, w
         method, trained = method_of(config), _name_of(config.get("corruption"))
         methods = [method] if method == "pathpose" else [method, "posereg"]
         fold = _fold(config["data"]["split"])
+        planner = planner_of(config)
         for name in corruptions:
             corruption = compose_config("prepare", [f"corruption={name}"])["corruption"]
             places = {
                 one: results / "raw" / f"{one}-{fold}-trained_{trained}-seed{config['seed']}-{name}.json"
                 for one in methods
             }
-            if all(_is_done(place, corruption, run) for place in places.values()):
+            if all(_is_done(place, corruption, planner, run) for place in places.values()):
                 continue
             print(f"{method}: {run} on {name}", flush=True)
             for one, found in judge(run, config, corruption).items():
@@ -119,14 +127,17 @@ def judge_all(runs: Sequence[Path], corruptions: Sequence[str], results: Path, w
                 place = places[one]
                 place.parent.mkdir(parents=True, exist_ok=True)
                 part = place.with_suffix(".part")
-                write_json(part, {**about, "settings": corruption, "run": run.resolve().name, **found})
+                write_json(
+                    part, {**about, "settings": corruption, "planner": planner, "run": run.resolve().name, **found}
+                )
                 os.replace(part, place)
 
 
-def _is_done(place: Path, corruption: Mapping[str, Any], run: Path) -> bool:
+def _is_done(place: Path, corruption: Mapping[str, Any], planner: Any, run: Path) -> bool:
     try:
         found = json.loads(place.read_text())
-        return bool(found["settings"] == corruption and found["run"] == run.resolve().name)
+        same = found["settings"] == corruption and found.get("planner") == planner
+        return bool(same and found["run"] == run.resolve().name)
     except (OSError, ValueError, KeyError, TypeError):
         return False
 
