@@ -24,11 +24,11 @@ NOTEBOOK = "notebooks/first_look.ipynb"
 API = {
     "motion": "motion rotations skeleton kinematics mapping retarget contacts ground settle io",
     "humanoid": "config model from_motion physics",
-    "vision": "video flow lens turning features encoders rendering rooms takes",
+    "vision": "video flow lens turning features encoders rendering rooms takes limbs limb_pictures",
     "data": "sources preparation prepare_motion sync store splits feasibility gate",
     "envs": "build problem env task starts transforms mdp.observations mdp.rewards mdp.terminations",
     "models": "policy context episode_context regressor pose_regression mirror",
-    "training": "loop ppo collectors supervised predictions checkpoint",
+    "training": "loop ppo collectors supervised limb_finder predictions checkpoint",
     "inference": "estimator failsafe forecaster bands",
     "evaluation": "metrics position_metrics protocols statistics survival agents",
 }

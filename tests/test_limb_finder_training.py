@@ -91,7 +91,7 @@ def test_resumed_training_equals_one_that_was_never_stopped(
         torch.testing.assert_close(parted.state_dict()[key], value, rtol=0, atol=0)
     other = train_finder(data, skeleton, few, seed=3)
     assert not torch.equal(other.posture.weight, whole.posture.weight)
-    with pytest.raises(InputError, match="missing or of another shape"):
+    with pytest.raises(InputError, match="training: settings: are another training's"):
         train_finder(data, skeleton, replace(few, channels=16), 2, tmp_path / "training")
 
 

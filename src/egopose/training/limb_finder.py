@@ -21,7 +21,7 @@ from egopose.config import from_mapping
 from egopose.errors import InputError
 from egopose.models.mirror import StateMirror, joint_mirror
 from egopose.motion.skeleton import Skeleton
-from egopose.training.checkpoint import ComponentState, RunCheckpoint, metadata_of
+from egopose.training.checkpoint import ComponentState, RunCheckpoint, metadata_of, read_json
 from egopose.training.predictions import torch_threads
 from egopose.vision.flow import FlowConfig
 from egopose.vision.limb_pictures import BODIES, posture_names
@@ -218,6 +218,12 @@ class FinderTraining:
         self.steps += 1
         return float(loss.detach())
 
+    def terms(self) -> dict[str, Any]:
+        """All that the result depends on but for the pictures themselves."""
+        free = ("save_every", "threads")
+        settings = {key: value for key, value in asdict(self.settings).items() if key not in free}
+        return {**settings, "seed": self.seed, "samples": len(self.data)}
+
     def state(self) -> State:
         """Everything needed to go on."""
         out = {"steps": torch.tensor(self.steps)}
@@ -227,15 +233,8 @@ class FinderTraining:
         return out
 
     def load(self, state: State) -> None:
-        """Go on from :meth:`state`.
-
-        Raises:
-            InputError: it is of another model; names the tensor.
-        """
+        """Go on from :meth:`state` of a training with the same :meth:`terms`."""
         model = {key.removeprefix("model/"): value for key, value in state.items() if key.startswith("model/")}
-        for key, value in self.model.state_dict().items():
-            if key not in model or model[key].shape != value.shape:
-                raise InputError("training state", key, "is missing or of another shape")
         self.model.load_state_dict(model)
         moments: dict[int, State] = {}
         for key, value in state.items():
@@ -277,11 +276,13 @@ def train_finder(
         The finder, in evaluation mode.
 
     Raises:
-        InputError: there are too few pictures; ``folder`` is damaged or of another finder.
+        InputError: there are too few pictures; ``folder`` is damaged or of another training.
     """
     with torch_threads(settings.threads):
         work = FinderTraining(data, skeleton, settings, seed)
         if folder is not None and folder.is_dir():
+            if read_json(folder, "terms") != work.terms():
+                raise InputError(folder, "settings", "are another training's: remove it or name another folder")
             state: State = {}
             RunCheckpoint({"training": ComponentState(dict, state.update)}).restore(folder)
             work.load(state)
@@ -292,9 +293,9 @@ def train_finder(
             if work.steps % settings.save_every and work.steps < work.total_steps:
                 continue
             if folder is not None:
-                RunCheckpoint({"training": ComponentState(work.state, lambda _: None)}).save(
-                    folder, metadata=metadata_of("limb finder training", work.model.numbers, 0, work.steps, 0.0)
-                )
+                parts = {"training": ComponentState(work.state, lambda _: None), "terms": work.terms()}
+                metadata = metadata_of("limb finder training", work.model.numbers, 0, work.steps, 0.0)
+                RunCheckpoint(parts).save(folder, metadata=metadata)
             if told is not None:
                 told(work.steps, work.total_steps, sum(losses) / len(losses))
             losses = []
