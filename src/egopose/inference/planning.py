@@ -44,6 +44,7 @@ class PlannerSettings:
         acceleration: reward lost per unit (m/s^2, rad/s^2) of the velocities' mean absolute change.
         head: reward lost per metre by which the head is lower than what is followed has it.
         discount: of a frame.
+        kappa: of the fail-safe, where it has none of its own, for the values of plans.
         reward: as a file of ``conf/reward`` in the heading frame: how near the body is to what it follows.
         seed: of the additions.
     """
@@ -57,6 +58,7 @@ class PlannerSettings:
     acceleration: float
     head: float
     discount: float
+    kappa: float
     reward: Any
     seed: int
 
@@ -65,7 +67,7 @@ class PlannerSettings:
             if not ok:
                 raise InputError("planner", name, cause)
 
-        check(self.samples >= 2, "samples", "must be at least 2: without an addition, and with one")
+        check(self.samples >= 3, "samples", "must be at least 3: without an addition, the plan so far, and a new one")
         check(0 < self.every <= self.horizon, "every", "must lie between 1 and the horizon")
         check(self.knot > 0, "knot", "must be positive")
         check(self.deviation > 0, "deviation", "must be positive")
@@ -219,6 +221,11 @@ class Planner:
     def close(self) -> None:
         """Stop the copies' physics."""
         self._env.close()
+
+
+def planned_kappa(settings: PlannerSettings | None) -> float | None:
+    """The fail-safe's kappa for a planner's values; None without a planner."""
+    return None if settings is None else settings.kappa
 
 
 def planner_settings(values: Mapping[str, Any] | None) -> PlannerSettings | None:
