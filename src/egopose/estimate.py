@@ -187,15 +187,16 @@ def run_estimate(config: Mapping[str, Any], agent: Agent, pose_motion: Motion, v
     from egopose.evaluation.tables import write_columns_csv
     from egopose.inference.estimator import estimate_takes
     from egopose.inference.failsafe import FailSafe, FailSafeSettings
-    from egopose.inference.planning import Planner
+    from egopose.inference.planning import Planner, planned_kappa
     from egopose.vision.lens import Camera
 
     failsafe = from_mapping(FailSafeSettings, config["failsafe"], "conf/estimate.yaml: failsafe")
-    guard = FailSafe(1, failsafe.for_run(agent.config))
+    settings = allowed_planner(config)
+    guard = FailSafe(1, failsafe.for_run(agent.config, planned_kappa(settings)))
     torch.set_num_threads(1)
     options = {"threads": 1, "whole_fragments": True, "falls_end": False}
     env = agent.make_env("test", worlds=1, **options)
-    lookahead, settings, states = allowed_lookahead(config), allowed_planner(config), agent.followed_states()
+    lookahead, states = allowed_lookahead(config), agent.followed_states()
     planner = None
     if settings is not None:
         copies = agent.make_env("test", worlds=settings.samples, **{**options, "threads": int(config["threads"])})

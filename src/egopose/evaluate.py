@@ -71,7 +71,7 @@ def run_evaluation(
     from egopose.evaluation.agents import evaluate_agent, failsafe_figures, survival_figures
     from egopose.evaluation.protocols import ContactSettings, fragment_names
     from egopose.inference.failsafe import FailSafeSettings
-    from egopose.inference.planning import planner_settings
+    from egopose.inference.planning import planned_kappa, planner_settings
     from egopose.pipeline import build_networks
 
     source = "conf/evaluate.yaml"
@@ -90,7 +90,7 @@ def run_evaluation(
     runs = [
         evaluate_agent(agent, fragments, labels, split, failsafe, contact, threads, window, planner) for agent in agents
     ]
-    guards = [failsafe.for_run(agent.config) for agent in agents]
+    guards = [failsafe.for_run(agent.config, planned_kappa(planner)) for agent in agents]
     guarded = [failsafe_figures(run, guard, window) for run, guard in zip(runs, guards, strict=True)]
     interval, survive = config["interval"], config["survival"]
     comparison = report.compare_runs(runs, float(interval["level"]), int(interval["draws"]), int(interval["seed"]))

@@ -17,7 +17,7 @@ from egopose.evaluation.triggers import TakeTriggers, as_dict, take_triggers
 from egopose.inference.estimator import Controller, Estimate, estimate_takes
 from egopose.inference.failsafe import FailSafe, FailSafeSettings
 from egopose.inference.forks import Forks
-from egopose.inference.planning import Planner, PlannerSettings
+from egopose.inference.planning import Planner, PlannerSettings, planned_kappa
 from egopose.models.pose_regression import pose_regression
 from egopose.motion import rotations as rot
 from egopose.motion.motion import Motion
@@ -105,7 +105,7 @@ def estimate_and_judge(
         return agent.make_env(split, worlds=count, threads=threads, whole_fragments=True, falls_end=False)
 
     env, forks = make_env(worlds), Forks()
-    guard, states = FailSafe(worlds, failsafe.for_run(agent.config)), agent.followed_states()
+    guard, states = FailSafe(worlds, failsafe.for_run(agent.config, planned_kappa(planner))), agent.followed_states()
     ahead = (
         None
         if planner is None

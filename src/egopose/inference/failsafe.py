@@ -43,9 +43,12 @@ class FailSafeSettings:
         if self.mode not in MODES:
             raise InputError("failsafe", "mode", f"must be one of {', '.join(MODES)}, not {self.mode!r}")
 
-    def for_run(self, config: Mapping[str, Any]) -> FailSafeSettings:
-        """With ``kappa`` as it stands, or where there is none the paper's at the discount of a run's ``config``."""
-        return self if self.kappa is not None else replace(self, kappa=paper_kappa(float(config["algo"]["gamma"])))
+    def for_run(self, config: Mapping[str, Any], planned: float | None = None) -> FailSafeSettings:
+        """With ``kappa`` as it stands; where there is none ``planned``, which is meant for a planner's values, else the
+        paper's at the discount of a run's ``config``."""
+        if self.kappa is not None:
+            return self
+        return replace(self, kappa=paper_kappa(float(config["algo"]["gamma"])) if planned is None else planned)
 
 
 def paper_kappa(discount: float) -> float:
