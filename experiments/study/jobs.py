@@ -121,7 +121,8 @@ def _estimates(
         found = evaluate_agent(agent, fragments, labels, "test", failsafe, contact, threads, planner=planner)
         diverged = sum(one.estimate.diverged for one in found)
         survival = {"survival": _survival(agent, settings)} if job.survival else {}
-        return raw_figures([one.scores for one in found]) | {"diverged": int(diverged)} | survival
+        fallen = [int(one.estimate.fallen.sum()) for one in found]
+        return raw_figures([one.scores for one in found]) | {"diverged": int(diverged), "fallen": fallen} | survival
     material = _material(folder, config, judged)
     fragments = list(material.test)
     labels = _labels(judged, fragments)

@@ -33,6 +33,7 @@ OURS = {"estimation": "ours", "forecasting": "ours_forecast"}
 LABELS = {
     "ours": "ours",
     "ours_forecast": "ours",
+    "no_planner": "ours, the policy alone",
     "posereg": "PoseReg",
     "vgail": "VGAIL",
     "pathpose": "PathPose",
@@ -209,15 +210,16 @@ def estimation_table(found: Mapping[tuple[str, str], Scores], measured: Mapping[
     lines: list[str] = []
     for protocol, metrics in (("single", 3), ("cross", 3), ("wild", 2)):
         keys = [name for name in PAPER if name.startswith(f"{protocol}/")][:metrics]
-        methods = [m for m in ("ours", "vgail", "pathpose", "posereg") if (protocol, m) in found]
+        methods = [m for m in ("ours", "no_planner", "vgail", "pathpose", "posereg") if (protocol, m) in found]
         if not methods:
             continue
         heads = [name.split("/")[1] for name in keys]
         title = {"single": "Single subject", "cross": "Cross subject", "wild": "In the wild"}[protocol]
+        heading = ["method", *(METRICS[h] for h in heads)]
         lines += [
             f"## {title}",
             "",
-            *_header(["method", *(METRICS[h] for h in heads), "resets a minute", "whole takes", "seeds", "takes"]),
+            *_header([*heading, "resets a minute", "whole takes", "fallen", "seeds", "takes"]),
         ]
         for method in methods:
             scores = found[protocol, method]
@@ -225,9 +227,18 @@ def estimation_table(found: Mapping[tuple[str, str], Scores], measured: Mapping[
             seeds = scores.seeds(folds)
             cells = [_cell(_interval(scores, METRICS[h], folds, seeds)) for h in heads]
             takes = sum(len(names) for names in scores.takes(folds))
-            lines.append(_row([LABELS[method], *cells, *_resets(scores, folds, seeds), str(len(seeds)), str(takes)]))
+            told = [*_resets(scores, folds, seeds), _fallen(scores, folds, seeds), str(len(seeds)), str(takes)]
+            lines.append(_row([LABELS[method], *cells, *told]))
         lines += ["", *_ratio_rows([f"{protocol}/{h}" for h in heads], measured), ""]
     return lines
+
+
+def _fallen(scores: Scores, folds: Sequence[str], seeds: Sequence[int]) -> str:
+    """Share of the frames in which the head is too low for the take; empty where that was not noted."""
+    results = [scores.results[fold][seed] for fold in folds for seed in seeds]
+    if not all("fallen" in result for result in results):
+        return ""
+    return f"{sum(sum(r['fallen']) for r in results) / sum(sum(r['frames']) for r in results):.1%}"
 
 
 def ablation_table(found: Mapping[tuple[str, str], Scores]) -> list[str]:
