@@ -101,6 +101,9 @@ def _find_limbs(config: Mapping[str, Any], store: TakeStore, flow: Tensor, finde
     from egopose.vision.features import extract_limbs
 
     print(f"finding limbs in {store.frames_total} pictures", file=sys.stderr, flush=True)
+    if not all(take.rendered for take in store.takes):
+        told = "the limb finder has never seen a filmed body: compare with regressor.kernel.limbs=null"
+        print(f"note: {told}", file=sys.stderr, flush=True)
     settings = FlowConfig(**dict(config["vision"]["flow"]))
     rows = []
     for index, take in enumerate(store.takes):
