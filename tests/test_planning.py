@@ -189,6 +189,21 @@ def test_without_a_better_way_the_policy_goes_on_alone() -> None:
     torch.testing.assert_close(planner.value, worth.float(), rtol=0, atol=1e-4)
 
 
+def test_small_gains_change_nothing() -> None:
+    """The policy goes on alone while that is within the margin of the best way."""
+    followed = other_motion()
+    base = leaning(make_env(2))
+    free = planner_for(2, states_of(followed), margin=0.0)
+    best = whole_way(free, base)
+    assert best.abs().amax(dim=(1, 2)).min() > 0
+    nothing = torch.zeros_like(best)
+    gain = simulated(base, best, followed, free.settings)[1] - simulated(base, nothing, followed, free.settings)[1]
+    assert (gain > 0).all()
+    wide, narrow = (planner_for(2, states_of(followed), margin=float(m)) for m in (gain.max() + 1, gain.min() / 2))
+    assert not whole_way(wide, base).any()
+    torch.testing.assert_close(whole_way(narrow, base), best, rtol=0, atol=0)
+
+
 def test_only_what_balances_is_added_to_and_smoothly() -> None:
     base = leaning(make_env(2))
     planner = planner_for(2, states_of(true_motion()[0]), joints=["Leg"], knot=4, horizon=9, every=9)
@@ -277,12 +292,13 @@ def test_a_restart_by_the_fail_safe_is_planned_for() -> None:
     ("changed", "field"),
     [
         ({"samples": 2}, "samples"),
-        ({"horizon": 3}, "every"),
+        ({"horizon": 1}, "every"),
         ({"every": 0}, "every"),
         ({"knot": 0}, "knot"),
         ({"deviation": 0.0}, "deviation"),
         ({"acceleration": -1.0}, "acceleration"),
         ({"head": -1.0}, "head"),
+        ({"margin": -1.0}, "margin"),
         ({"discount": 0.0}, "discount"),
         ({"discount": 1.1}, "discount"),
         ({"reward": None}, "reward"),

@@ -283,6 +283,9 @@ def _blend(
     tables = _with_targets(blended.model, tables, humanoid, settings)
     centres, axes = blended.kernel.centres.shape
     sizes = {**made_with, "regressor": config["regressor"], "centres": centres, "axes": axes}
+    finder = finder_of(config["regressor"])
+    if finder is not None:
+        sizes["finder"] = finder_fingerprint(finder)
     card = {**store.table_card(network_name), "shares": blended.shares, "centres": centres}
     _keep(store, name, blended.model, tables, sizes, card)
 
@@ -339,6 +342,9 @@ def load_regressor(weights: str | Path) -> tuple[StateRegressor, dict[str, Any]]
         blank = KernelRegression(inputs, int(config["axes"]), int(config["centres"]), size)
         model = blended_regressor(model, blank, kernel.cells, windows, kernel.limb_numbers)
     RunCheckpoint({"regressor": model}).restore(folder)
+    finder = finder_of(config["regressor"])
+    if finder is not None and config.get("finder", finder_fingerprint(finder)) != finder_fingerprint(finder):
+        raise InputError(folder, "finder", f"it was made with another limb finder {finder!r} than this egopose has")
     return model.eval(), config
 
 

@@ -43,6 +43,7 @@ class PlannerSettings:
         joints: only hinges whose name contains one of these are added to.
         acceleration: reward lost per unit (m/s^2, rad/s^2) of the velocities' mean absolute change.
         head: reward lost per metre by which the head is lower than what is followed has it.
+        margin: reward by which a way must do better than the plan so far to be taken, and either than no addition.
         discount: of a frame.
         kappa: of the fail-safe, where it has none of its own, for the values of plans.
         reward: as a file of ``conf/reward`` in the heading frame: how near the body is to what it follows.
@@ -57,6 +58,7 @@ class PlannerSettings:
     joints: tuple[str, ...]
     acceleration: float
     head: float
+    margin: float
     discount: float
     kappa: float
     reward: Any
@@ -71,7 +73,8 @@ class PlannerSettings:
         check(0 < self.every <= self.horizon, "every", "must lie between 1 and the horizon")
         check(self.knot > 0, "knot", "must be positive")
         check(self.deviation > 0, "deviation", "must be positive")
-        check(min(self.acceleration, self.head) >= 0, "acceleration", "must not be negative, nor head")
+        least = min(self.acceleration, self.head, self.margin)
+        check(least >= 0, "acceleration", "must not be negative, nor head, nor margin")
         check(0 < self.discount <= 1, "discount", "must lie in (0, 1]")
         kind = self.reward.get("kind") if isinstance(self.reward, Mapping) else None
         check(kind == "heading_frame", "reward", "must be one in the heading frame")
@@ -207,6 +210,9 @@ class Planner:
         worlds = torch.arange(ways.shape[1])
         score, worth = ((rows).unflatten(0, ways.shape[:2]) for rows in (worth - cost, worth))
         best = score.argmax(0)
+        # Chance finds small gains in any noise; to follow each of them is to tremble.
+        enough = score.amax(0) - settings.margin
+        best = torch.where(score[0] >= enough, 0, torch.where(score[1] >= enough, 1, best))
         self.value = worth[best, worlds]
         self._plan[:, : settings.horizon] = ways[best, worlds]
 

@@ -114,7 +114,8 @@ def load_finder(name: str) -> LimbFinder:
     from egopose.weights import FOLDER
 
     folder = FOLDER / name
-    if not (folder / "manifest.json").is_file():
+    # A name from a stranger's configuration must not lead out of the package.
+    if folder.parent != FOLDER or name in (".", "..") or not (folder / "manifest.json").is_file():
         raise InputError("regressor.kernel", "limbs", f"no limb finder {name!r} comes with egopose")
     config = read_json(folder, "config")
     finder = LimbFinder(len(config["names"]), int(config["channels"]))
