@@ -328,14 +328,15 @@ def test_what_cannot_be_planned_for_is_refused() -> None:
 def estimated_by(planner: PlannerSettings | None) -> list[Estimate]:
     """What an evaluation makes of both takes."""
 
-    def env_of(split: str, *, worlds: int, threads: int, whole_fragments: bool, falls_end: bool) -> TransformedEnv:
-        assert whole_fragments
-        assert not falls_end
+    def env_of(split: str, *, worlds: int, threads: int, fragments: Any, **options: bool) -> TransformedEnv:
+        assert options == {"whole_fragments": True, "falls_end": False}
+        assert list(fragments) == list(PIECES)
         return frozen(make_env(worlds, threads=threads))
 
     states = states_of(other_motion())
     agent: Any = SimpleNamespace(
         make_env=env_of,
+        material=SimpleNamespace(test=PIECES),
         actor=actor(),
         critic=critic(),
         followed_states=lambda: states,

@@ -324,7 +324,7 @@ def load_regressor(weights: str | Path) -> tuple[StateRegressor, dict[str, Any]]
         weights: ``STORE/regressors/NAME``, or ``RUN_DIR/regressor``.
 
     Raises:
-        InputError: the folder is damaged or of another kind.
+        InputError: the folder is damaged or of another kind, or was made with another limb finder.
     """
     folder = Path(weights)
     config = read_json(folder, "config")

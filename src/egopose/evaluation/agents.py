@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from egopose.pipeline import Agent
 
 SHORTEST = 4  # frames that every metric needs
+_PLANNED_TOGETHER = 4  # fragments: with 64 copies each enough to keep the physics' threads busy
 
 
 @dataclass(frozen=True)
@@ -100,17 +101,45 @@ def estimate_and_judge(
 
     Other arguments as of :func:`evaluate_agent`.
     """
+    material = agent.material
+    fragments = list(material.train if split == "train" else material.test)[:worlds]
+    by_length = sorted(range(worlds), key=lambda i: fragments[i].stop - fragments[i].start)
+    # All worlds are stepped until the longest fragment ends, and with a planner each has dozens of copies: those of
+    # like length go together.
+    groups = [list(range(worlds))]
+    if planner is not None:
+        groups = [by_length[at : at + _PLANNED_TOGETHER] for at in range(0, worlds, _PLANNED_TOGETHER)]
+    estimates: dict[int, Estimate] = {}
+    triggers: dict[int, TakeTriggers | None] = {}
+    for group in groups:
+        chosen = [fragments[i] for i in group]
+        found, judged = _together(agent, chosen, split, failsafe, threads, window, planner)
+        estimates |= dict(zip(group, found, strict=True))
+        triggers |= dict(zip(group, judged, strict=True))
+    return [estimates[i] for i in range(worlds)], [triggers[i] for i in range(worlds)]
+
+
+def _together(
+    agent: Agent,
+    fragments: Sequence[FragmentLike],
+    split: str,
+    failsafe: FailSafeSettings,
+    threads: int,
+    window: int | None,
+    planner: PlannerSettings | None,
+) -> tuple[list[Estimate], Sequence[TakeTriggers | None]]:
+    """:func:`estimate_and_judge` of these fragments, in one pass."""
+    worlds = len(fragments)
 
     def make_env(count: int) -> TransformedEnv:
-        return agent.make_env(split, worlds=count, threads=threads, whole_fragments=True, falls_end=False)
+        options = {"threads": threads, "whole_fragments": True, "falls_end": False}
+        return agent.make_env(split, worlds=count, fragments=fragments, **options)
 
     env, forks = make_env(worlds), Forks()
     guard, states = FailSafe(worlds, failsafe.for_run(agent.config, planned_kappa(planner))), agent.followed_states()
-    ahead = (
-        None
-        if planner is None
-        else Planner(make_env(worlds * planner.samples), agent.actor, agent.critic, states, planner)
-    )
+    ahead = None
+    if planner is not None:
+        ahead = Planner(make_env(worlds * planner.samples), agent.actor, agent.critic, states, planner)
     estimates = estimate_takes(env, agent.actor, agent.critic, states, guard, forks=forks, planner=ahead)
     env.close()
     if ahead is not None:
