@@ -40,7 +40,7 @@ def run(overrides: Sequence[str], rounds: int) -> dict[str, Any]:
     threads = int(config["collector"]["physics_threads"])
     torch.set_num_threads(1)
     material = pipeline.motion_material(config)
-    options = {"threads": threads, "whole_fragments": True, "falls_end": False}
+    options: dict[str, Any] = {"threads": threads, "whole_fragments": True, "falls_end": False}
     env = pipeline.build_env(config, material, worlds=1, **options)
     copies = pipeline.build_env(config, material, worlds=settings.samples, **options)
     actor, critic = pipeline.build_networks(config, material, env)

@@ -205,6 +205,7 @@ def untrained_forecaster(values: Mapping[str, Any], trained: Trained) -> Forecas
     """
     from egopose.config import compose_config
     from egopose.pipeline import build_env, build_networks
+    from egopose.sight import planes_of
     from egopose.stream import Forecaster, forecast_settings, still_frames
 
     settings = forecast_settings(values)
@@ -216,4 +217,5 @@ def untrained_forecaster(values: Mapping[str, Any], trained: Trained) -> Forecas
     env = build_env(config, material, "test", worlds=worlds, whole_fragments=True, falls_end=False)
     actor, _ = build_networks(config, material, env)
     size = int(trained.made_with["vision"]["flow"]["stored_size"])
-    return Forecaster(env, actor.eval(), trained.regressor, size, settings)
+    seen = (planes_of(trained.made_with["regressor"]), size, size)
+    return Forecaster(env, actor.eval(), trained.regressor, seen, settings)

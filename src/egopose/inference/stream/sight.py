@@ -84,8 +84,8 @@ class Sight:
     def _with_limbs(self, flow: NDArray[np.float32], picture: Picture, first: bool) -> NDArray[np.float32]:
         assert self._finder is not None
         before, self._picture = picture if first else self._picture, picture
-        pair = (torch.from_numpy(one).permute(2, 0, 1)[None] for one in (before, picture))
-        rows = pair_rows(self._finder, *pair, torch.from_numpy(flow[None]))
+        earlier, now = (torch.from_numpy(one).permute(2, 0, 1)[None] for one in (before, picture))
+        rows = pair_rows(self._finder, earlier, now, torch.from_numpy(flow[None]))
         return np.concatenate([flow, as_plane(rows, flow.shape[-1])[0].astype(np.float32)])
 
     @torch.no_grad()
