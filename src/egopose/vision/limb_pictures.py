@@ -8,12 +8,10 @@ control steps, the flow between them, the share of each cell of the later one th
 from __future__ import annotations
 
 import hashlib
-import io
 import json
 import multiprocessing
 import os
 import uuid
-import zipfile
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import asdict, dataclass
@@ -30,6 +28,7 @@ from scipy.spatial.transform import Rotation
 from egopose.config import from_mapping
 from egopose.errors import InputError
 from egopose.files import write_text_whole
+from egopose.motion.io._npz import read_arrays
 from egopose.motion.rotations import Array, from_axis_angle, from_scipy, multiply, rotate
 from egopose.motion.skeleton import Skeleton
 from egopose.runtime import end_with_parent
@@ -410,8 +409,8 @@ def read_pictures(folder: Path, settings: PictureSettings, names: Sequence[str])
 
 def _read_part(path: Path, names: Sequence[str]) -> dict[str, NDArray[Any]]:
     try:
-        with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as held:
-            return {name: held[name] for name in names}
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+        held = read_arrays(path, names)
+        return {name: held[name] for name in names}
+    except (InputError, KeyError) as error:
         cause = f"cannot be read ({error}): remove the file to have it drawn again"
         raise InputError(path, "pictures", cause) from None
