@@ -250,7 +250,8 @@ from egopose.training.collectors import CollectorSettings, build_collector
 
 class Slow(ToyEnv):
     def _step(self, tensordict):
-        print("step", os.getpid(), flush=True)
+        # In one write, which no other worker's comes between.
+        os.write(1, b"step %d\n" % os.getpid())
         time.sleep(600)
 
 def slow(worker):
@@ -270,11 +271,13 @@ def test_a_killed_learner_leaves_no_workers(kind: str, tmp_path: Path) -> None:
     program.write_text(LONG_STEP.format(tests=str(Path(__file__).parent), kind=kind))
     with subprocess.Popen([sys.executable, str(program)], stdout=subprocess.PIPE, text=True) as learner:
         assert learner.stdout is not None
-        steps = [learner.stdout.readline().split() for _ in range(2)]
-        started = family(os.getpid())
-        workers = {process for process in started if process[0] in {int(pid) for _, pid in steps}}
-        assert len(workers) == 2
-        learner.kill()
+        try:
+            steps = [learner.stdout.readline().split() for _ in range(2)]
+            started = family(os.getpid())
+            workers = {process for process in started if process[0] in {int(pid) for _, pid in steps}}
+            assert len(workers) == 2
+        finally:  # or a failure would wait ten minutes for the step's end
+            learner.kill()
     assert end_of(workers, 20)[1] == set()
 
 
