@@ -251,7 +251,7 @@ from egopose.training.collectors import CollectorSettings, build_collector
 class Slow(ToyEnv):
     def _step(self, tensordict):
         # In one write, which no other worker's comes between.
-        os.write(1, b"step %d\n" % os.getpid())
+        os.write(1, b"step %d\\n" % os.getpid())
         time.sleep(600)
 
 def slow(worker):
