@@ -343,7 +343,7 @@ def load_regressor(weights: str | Path) -> tuple[StateRegressor, dict[str, Any]]
         model = blended_regressor(model, blank, kernel.cells, windows, kernel.limb_numbers)
     RunCheckpoint({"regressor": model}).restore(folder)
     finder = finder_of(config["regressor"])
-    if finder is not None and config.get("finder", finder_fingerprint(finder)) != finder_fingerprint(finder):
+    if finder is not None and config.get("finder") not in (None, finder_fingerprint(finder)):
         raise InputError(folder, "finder", f"it was made with another limb finder {finder!r} than this egopose has")
     return model.eval(), config
 

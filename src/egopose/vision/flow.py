@@ -58,16 +58,22 @@ class FlowConfig:
             raise InputError("vision.flow", "workers", f"{self.workers}; at least 1")
 
 
-def grey_square(frame: Frame, size: int) -> NDArray[np.uint8]:
-    """The centred square of an RGB frame ``[H, W, 3]``, grey, area-averaged to ``[size, size]`` uint8."""
+def centred_square(frame: Frame, size: int) -> NDArray[np.uint8]:
+    """The centred square of an RGB frame ``[H, W, 3]``, area-averaged to ``[size, size, 3]`` uint8."""
     height, width = frame.shape[:2]
     side = min(height, width)
     top, left = (height - side) // 2, (width - side) // 2
     square = frame[top : top + side, left : left + side]
-    # Shrinking first leaves less to turn grey; enlarging by area would give blocks.
-    interpolation = cv2.INTER_AREA if side >= size else cv2.INTER_LINEAR
-    resized = square if side == size else cv2.resize(square, (size, size), interpolation=interpolation)
-    return cv2.cvtColor(resized, cv2.COLOR_RGB2GRAY).astype(np.uint8, copy=False)
+    if side == size:
+        return square
+    # Enlarging by area would give blocks.
+    interpolation = cv2.INTER_AREA if side > size else cv2.INTER_LINEAR
+    return cv2.resize(square, (size, size), interpolation=interpolation).astype(np.uint8, copy=False)
+
+
+def grey_square(frame: Frame, size: int) -> NDArray[np.uint8]:
+    """:func:`centred_square` in grey, ``[size, size]`` uint8; shrinking first leaves less to turn grey."""
+    return cv2.cvtColor(centred_square(frame, size), cv2.COLOR_RGB2GRAY).astype(np.uint8, copy=False)
 
 
 class FlowEstimator:

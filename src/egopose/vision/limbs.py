@@ -10,13 +10,13 @@ from __future__ import annotations
 import functools
 from collections.abc import Sequence
 
-import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional
 
+from egopose.vision.flow import centred_square
 from egopose.vision.video import Frame
 
 #: Side in pixels of the pictures it looks at, and of the flow (conf/vision/light.yaml's stored size).
@@ -125,13 +125,8 @@ def load_finder(name: str) -> LimbFinder:
 
 def small_picture(frame: Frame) -> Picture:
     """The centred square of an RGB frame ``[H, W, 3]``, area-averaged to what a finder looks at."""
-    height, width = frame.shape[:2]
-    side = min(height, width)
-    top, left = (height - side) // 2, (width - side) // 2
-    square = frame[top : top + side, left : left + side]
-    shrinks = side >= PICTURE
-    method = cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR
-    return cv2.resize(square, (PICTURE, PICTURE), interpolation=method).astype(np.uint8, copy=False)
+    # A copy also of a frame of that size: pictures are kept, and a reader's buffer may not be.
+    return centred_square(frame, PICTURE).copy()
 
 
 @torch.no_grad()
