@@ -24,7 +24,7 @@ from egopose.models.blended import TimeWindows, blended_regressor, flow_cells
 from egopose.models.kernel_regression import KernelRegression, fit_kernel_regression
 from egopose.models.regressor import StateRegressor
 from egopose.regression import kept_tables, load_regressor, regressor_name, regressor_tables
-from egopose.training.blending import KernelSettings, choose_shares, fit_kernel, share_groups, window_table
+from egopose.training.blending import KernelSettings, choose_shares, fit_kernels, share_groups, window_table
 from egopose.training.fragments import Span, group_blocks, without_block
 from egopose.vision.encoders import LightFlowEncoder
 
@@ -107,7 +107,7 @@ def regressor() -> StateRegressor:
     kernel = KernelRegression(3 * 8, 5, 9, 115)
     for buffer in (kernel.projection, kernel.centres, kernel.coefficients):
         buffer.normal_()
-    model = blended_regressor(network, kernel, 2, windows)
+    model = blended_regressor(network, [kernel], 2, windows)
     model.head.network_share.fill_(0.4)
     model.head.kernel_share.fill_(0.6)
     return model
@@ -225,7 +225,7 @@ def test_a_store_makes_keeps_and_reads_back_a_blended_regressor(folder: Path) ->
     importance = torch.zeros(115)
     importance[[5 + dof for dof in range(52) if dof not in humanoid.hand_dofs]] = 1.0
     importance *= model.state_std
-    kernel = fit_kernel(table, wanted, without_block(half, block, 2, 2), kernel_settings, importance)
+    (kernel,) = fit_kernels(table, wanted, without_block(half, block, 2, 2), kernel_settings, importance, None)
     by_network = model.normalise(regressor_tables(network, store, humanoid, flow)[0]["humanoid_state"])
     for span in block:
         rows = slice(span.start, span.stop)

@@ -195,7 +195,7 @@ def regressor() -> StateRegressor:
     kernel = KernelRegression(3 * (8 + LIMBS), 5, 9, 115)
     for buffer in (kernel.projection, kernel.centres, kernel.coefficients):
         buffer.normal_()
-    model = blended_regressor(network, kernel, 2, TimeWindows(reach=2, step=2, width=0.5), LIMBS)
+    model = blended_regressor(network, [kernel], 2, TimeWindows(reach=2, step=2, width=0.5), LIMBS)
     model.head.network_share.fill_(0.4)
     model.head.kernel_share.fill_(0.6)
     return model

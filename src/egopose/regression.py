@@ -41,7 +41,7 @@ from egopose.training.predictions import Flow, predict_takes
 from egopose.training.regressor_settings import RegressorSettings
 from egopose.training.supervised import Progress, State, TrainingResult, build_regressor, train_regressor
 from egopose.untrusted import read_json as read_json_file
-from egopose.vision.encoders import FLOW_CHANNELS, build_encoder
+from egopose.vision.encoders import build_encoder
 
 TABLE_KEYS = ("humanoid_state", "visual_context", "visual_features", "joint_targets")
 
@@ -281,7 +281,8 @@ def _blend(
     for span in _training_spans(config, store):
         tables["humanoid_state"][span.start : span.stop] = blended.crossed[span.start : span.stop]
     tables = _with_targets(blended.model, tables, humanoid, settings)
-    centres, axes = blended.kernel.centres.shape
+    centres = len(blended.kernels[0].centres)
+    axes = [kernel.centres.shape[1] for kernel in blended.kernels]
     sizes = {**made_with, "regressor": config["regressor"], "centres": centres, "axes": axes}
     finder = finder_of(config["regressor"])
     if finder is not None:
@@ -338,8 +339,10 @@ def load_regressor(weights: str | Path) -> tuple[StateRegressor, dict[str, Any]]
     if _network_config(config) is not None:
         kernel = _kernel_settings(config)
         windows = kernel.windows()
-        inputs = windows.count * (FLOW_CHANNELS * kernel.cells**2 + kernel.limb_numbers)
-        blank = KernelRegression(inputs, int(config["axes"]), int(config["centres"]), size)
+        inputs, centres = kernel.input_sizes(), int(config["centres"])
+        # One number where it was made before there could be several kernels.
+        axes = config["axes"] if isinstance(config["axes"], list) else [config["axes"]]
+        blank = [KernelRegression(seen, int(kept), centres, size) for seen, kept in zip(inputs, axes, strict=True)]
         model = blended_regressor(model, blank, kernel.cells, windows, kernel.limb_numbers)
     RunCheckpoint({"regressor": model}).restore(folder)
     finder = finder_of(config["regressor"])

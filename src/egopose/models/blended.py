@@ -9,6 +9,7 @@ Yuan & Kitani 2019, whose PoseReg it is not.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor, nn
@@ -68,18 +69,27 @@ class TimeWindows(nn.Module):
         reach: frames from the middle to the centre of the outermost window.
         step: frames from window to window; divides ``reach``.
         width: standard deviation of a window in frames.
+        also: further sets of windows, each ``(reach, step, width)``; their means follow those of the first set.
     """
 
     weights: Tensor
 
-    def __init__(self, reach: int, step: int, width: float) -> None:
+    def __init__(self, reach: int, step: int, width: float, also: Sequence[tuple[int, int, float]] = ()) -> None:
         super().__init__()
-        centres = range(-reach, reach + 1, step)
+        sets = [(reach, step, width), *also]
+        #: Windows of each set.
+        self.counts = [len(range(-reach, reach + 1, step)) for reach, step, _ in sets]
         #: Frames either side that count.
-        self.radius = reach + math.ceil(3 * width)
-        self.count = len(centres)
+        self.radius = max(reach + math.ceil(3 * width) for reach, _, width in sets)
+        self.count = sum(self.counts)
         frame = torch.arange(-self.radius, self.radius + 1, dtype=torch.float64)
-        rows = torch.stack([torch.exp(-0.5 * ((frame - centre) / width) ** 2) for centre in centres])
+        rows = torch.stack(
+            [
+                torch.exp(-0.5 * ((frame - centre) / width) ** 2)
+                for reach, step, width in sets
+                for centre in range(-reach, reach + 1, step)
+            ]
+        )
         self.register_buffer("weights", (rows / rows.sum(1, keepdim=True)).float(), persistent=False)
 
     def forward(self, padded: Tensor) -> Tensor:
@@ -147,6 +157,25 @@ class BlendedContext(BidirectionalContext):
         return torch.cat([contexts, self.windows(padded)], dim=-1), (*after, passed)
 
 
+class MeanOfKernels(nn.Module):
+    """The mean of what several kernel regressions say, each of its own set of time windows.
+
+    Args:
+        kernels: one a set.
+    """
+
+    def __init__(self, kernels: Sequence[KernelRegression]) -> None:
+        super().__init__()
+        self.kernels = nn.ModuleList(kernels)
+        self.sizes = [len(kernel.input_mean) for kernel in kernels]
+
+    def forward(self, windows: Tensor) -> Tensor:
+        """``[..., V]``, the sets one after another -> ``[..., S]``."""
+        parts = windows.split(self.sizes, dim=-1)
+        answers = [kernel(part) for kernel, part in zip(self.kernels, parts, strict=True)]
+        return torch.stack(answers).mean(0)
+
+
 class BlendedHead(nn.Module):
     """Context to state in normalised units, whose zero is the training mean.
 
@@ -160,7 +189,9 @@ class BlendedHead(nn.Module):
     network_share: Tensor
     kernel_share: Tensor
 
-    def __init__(self, network: nn.Module, kernel: KernelRegression, context_size: int, state_size: int) -> None:
+    def __init__(
+        self, network: nn.Module, kernel: KernelRegression | MeanOfKernels, context_size: int, state_size: int
+    ) -> None:
         super().__init__()
         self.network, self.kernel, self.context_size = network, kernel, context_size
         self.register_buffer("network_share", torch.zeros(state_size))
@@ -173,24 +204,27 @@ class BlendedHead(nn.Module):
 
 
 def blended_regressor(
-    network: StateRegressor, kernel: KernelRegression, cells: int, windows: TimeWindows, limbs: int = 0
+    network: StateRegressor, kernels: Sequence[KernelRegression], cells: int, windows: TimeWindows, limbs: int = 0
 ) -> StateRegressor:
-    """F of ``network``'s parts and the kernel; the shares of its head are zero until they are set.
+    """F of ``network``'s parts and the kernels; the shares of its head are zero until they are set.
 
     Args:
         network: trained, with its encoder; its parts become those of the answer.
-        kernel: of ``windows`` over ``cells``.
+        kernels: one a set of ``windows``, over ``cells``.
         cells, limbs: see :func:`kernel_view`.
         windows: of time.
 
     Raises:
-        ValueError: the network has no encoder of flow.
+        ValueError: the network has no encoder of flow, or kernels and sets of windows differ in number.
     """
+    if len(kernels) != len(windows.counts):
+        raise ValueError(f"{len(windows.counts)} sets of windows need as many kernels, not {len(kernels)}")
     if not isinstance(network.encoder, FlowEncoder):
         raise ValueError("a regressor of flow is needed")
     size, own = len(network.state_mean), network.context.output_size
     size_seen = FLOW_CHANNELS * cells**2 + limbs
     network.encoder = CellEncoder(network.encoder, cells, limbs)
     network.context = BlendedContext(network.context, size_seen, windows)
+    kernel = kernels[0] if len(kernels) == 1 else MeanOfKernels(kernels)
     network.head = BlendedHead(network.head, kernel, own, size)
     return network.eval()

@@ -16,12 +16,14 @@ from torch import Tensor
 
 from egopose.errors import InputError
 from egopose.humanoid.model import HumanoidModel
-from egopose.models.blended import TimeWindows, blended_regressor, kernel_view
+from egopose.models.blended import MeanOfKernels, TimeWindows, blended_regressor, kernel_view
 from egopose.models.kernel_regression import KernelRegression, fit_kernel_regression
+from egopose.models.mirror import StateMirror, state_mirror
 from egopose.models.regressor import StateRegressor
 from egopose.training.fragments import Span, without_block
 from egopose.training.predictions import Flow, take_frames, torch_threads
 from egopose.training.regressor_settings import RegressorSettings
+from egopose.vision.encoders import FLOW_CHANNELS
 from egopose.vision.limbs import load_finder
 
 
@@ -36,6 +38,9 @@ class KernelSettings:
         centres: moments of training remembered at most, evenly chosen.
         share_step: the shares are multiples of it.
         limbs: the limb finder whose answers the kernel sees too, by its name in the package; None for flow alone.
+        also: further sets of time windows ``(reach, step, width)``, each with a kernel of its own: the kernels' mean
+            answers.
+        mirror: every moment of training is remembered as its mirror image too.
     """
 
     cells: int
@@ -50,6 +55,8 @@ class KernelSettings:
     centres: int
     share_step: float
     limbs: str | None = None
+    also: tuple[tuple[int, int, float], ...] = ()
+    mirror: bool = False
 
     def __post_init__(self) -> None:
         def check(ok: bool, name: str, cause: str) -> None:
@@ -57,8 +64,12 @@ class KernelSettings:
                 raise InputError("regressor.kernel", name, cause)
 
         check(min(self.cells, self.axes, self.metric_rows) > 0, "cells", "must be positive, as must axes, metric_rows")
-        check(self.step > 0 and self.reach >= 0 and self.reach % self.step == 0, "step", "must divide reach")
-        check(self.width > 0 and self.ridge > 0 and self.length > 0, "width", "must be positive, as must ridge, length")
+        for name, sets in (("step", ((self.reach, self.step, self.width),)), ("also", self.also)):
+            divides = all(step > 0 and reach >= 0 and reach % step == 0 for reach, step, _ in sets)
+            check(divides, name, "the step must divide the reach")
+        widths = (self.width, *(width for _, _, width in self.also))
+        positive = min(*widths, self.ridge, self.length) > 0
+        check(positive, "width", "must be positive, as must ridge, length and the widths of also")
         check(self.centres >= 2, "centres", "must be at least 2")
         check(0 < self.share_step <= 1, "share_step", "must lie in (0, 1]")
 
@@ -68,7 +79,11 @@ class KernelSettings:
         return 0 if self.limbs is None else 2 * load_finder(self.limbs).numbers
 
     def windows(self) -> TimeWindows:
-        return TimeWindows(self.reach, self.step, self.width)
+        return TimeWindows(self.reach, self.step, self.width, self.also)
+
+    def input_sizes(self) -> list[int]:
+        """Numbers that each kernel sees."""
+        return [count * (FLOW_CHANNELS * self.cells**2 + self.limb_numbers) for count in self.windows().counts]
 
 
 @dataclass(frozen=True)
@@ -77,14 +92,14 @@ class Blend:
 
     Attributes:
         model: the blended F.
-        kernel: its kernel regression.
+        kernels: its kernel regressions, one a set of time windows.
         crossed: ``[F, S]`` states z on the training frames from fits that never saw them, blended by the same shares;
             elsewhere without meaning.
         shares: of network and kernel, by part of the body.
     """
 
     model: StateRegressor
-    kernel: KernelRegression
+    kernels: list[KernelRegression]
     crossed: Tensor
     shares: dict[str, tuple[float, float]]
 
@@ -118,17 +133,21 @@ def blend(
     """
     with torch_threads(settings.threads):
         seen = window_table(flow, takes, kernel_settings, settings.encode_batch)
+        image = None
+        if kernel_settings.mirror:
+            table = window_table(flow, takes, kernel_settings, settings.encode_batch, mirrored=True)
+            image = (table, network.normalise(state_mirror(humanoid.skeleton).state(states)))
         wanted, by_network = network.normalise(states), network.normalise(crossed_states)
         by_kernel = torch.zeros_like(wanted)
         importance = _importance(humanoid, network.state_std)
         for block in blocks:
             others = without_block(fragments, block, settings.margin, settings.margin)
-            left_out = fit_kernel(seen, wanted, others, kernel_settings, importance)
+            left_out = MeanOfKernels(fit_kernels(seen, wanted, others, kernel_settings, importance, image))
             for span in block:
                 by_kernel[span.start : span.stop] = left_out(seen[span.start : span.stop])
-        kernel = fit_kernel(seen, wanted, fragments, kernel_settings, importance)
+        kernels = fit_kernels(seen, wanted, fragments, kernel_settings, importance, image)
     model = blended_regressor(
-        network, kernel, kernel_settings.cells, kernel_settings.windows(), kernel_settings.limb_numbers
+        network, kernels, kernel_settings.cells, kernel_settings.windows(), kernel_settings.limb_numbers
     )
     frames = torch.cat([torch.arange(s.start, s.stop) for s in fragments])
     starts = torch.tensor([span.start for span in takes])
@@ -139,18 +158,21 @@ def blend(
         chosen[part] = choose_shares(first, second, truth, take, kernel_settings.share_step)
         model.head.network_share[members], model.head.kernel_share[members] = chosen[part]
     crossed = model.head.network_share * by_network + model.head.kernel_share * by_kernel
-    return Blend(model, kernel, crossed * model.state_std + model.state_mean, chosen)
+    return Blend(model, kernels, crossed * model.state_std + model.state_mean, chosen)
 
 
 @torch.no_grad()
-def window_table(flow: Flow, takes: Sequence[Span], settings: KernelSettings, batch: int) -> Tensor:
-    """What the kernel sees of each frame, ``[F, V]`` float32; zero outside of ``takes``.
+def window_table(
+    flow: Flow, takes: Sequence[Span], settings: KernelSettings, batch: int, mirrored: bool = False
+) -> Tensor:
+    """What the kernels see of each frame, ``[F, V]`` float32; zero outside of ``takes``.
 
     Args:
         flow: ``[F, 2, S, S]`` of the whole store, with a third plane where the kernel sees limbs.
         takes: each a clip by itself.
         settings: of the cells and windows.
         batch: frames read at a time.
+        mirrored: of the scene's mirror image.
     """
     windows = settings.windows()
     rows = torch.zeros(len(flow), 0)
@@ -159,6 +181,8 @@ def window_table(flow: Flow, takes: Sequence[Span], settings: KernelSettings, ba
         cells = torch.cat(
             [kernel_view(take_frames(flow, part), settings.cells, settings.limb_numbers) for part in parts]
         )
+        if mirrored:
+            cells = mirrored_view(cells, settings)
         seen = windows(windows.pad(cells[None]))[0]
         if not rows.shape[1]:
             rows = torch.zeros(len(flow), seen.shape[1])
@@ -166,10 +190,24 @@ def window_table(flow: Flow, takes: Sequence[Span], settings: KernelSettings, ba
     return rows
 
 
-def fit_kernel(
-    table: Tensor, wanted: Tensor, spans: Sequence[Span], settings: KernelSettings, importance: Tensor
-) -> KernelRegression:
-    """The kernel regression learned on ``spans``.
+def mirrored_view(view: Tensor, settings: KernelSettings) -> Tensor:
+    """Mirror image of what the kernels see of each frame, ``[T, V]`` (:func:`egopose.models.blended.kernel_view`)."""
+    flow, limbs = view.split([FLOW_CHANNELS * settings.cells**2, settings.limb_numbers], dim=1)
+    parts = [StateMirror.flow(flow.unflatten(1, (FLOW_CHANNELS, settings.cells, settings.cells))).flatten(1)]
+    if settings.limbs is not None:
+        parts.append(load_finder(settings.limbs).mirrored_rows(limbs))
+    return torch.cat(parts, dim=1)
+
+
+def fit_kernels(
+    table: Tensor,
+    wanted: Tensor,
+    spans: Sequence[Span],
+    settings: KernelSettings,
+    importance: Tensor,
+    image: tuple[Tensor, Tensor] | None,
+) -> list[KernelRegression]:
+    """The kernel regressions learned on ``spans``, one a set of time windows.
 
     Args:
         table: ``[F, V]`` of :func:`window_table`.
@@ -177,20 +215,31 @@ def fit_kernel(
         spans: training frames.
         settings: of the kernel.
         importance: ``[S]`` of the state's numbers for what counts as alike.
+        image: ``table`` and ``wanted`` of the mirrored scene, where it is learned as well; the centres are shared.
     """
     frames = torch.cat([torch.arange(s.start, s.stop) for s in spans])
-    if len(frames) > settings.centres:
-        frames = frames[torch.linspace(0, len(frames) - 1, settings.centres).round().long()]
-    return fit_kernel_regression(
-        table[frames],
-        wanted[frames],
-        axes=settings.axes,
-        whitening=settings.whitening,
-        ridge=settings.ridge,
-        length=settings.length,
-        importance=importance,
-        metric_rows=settings.metric_rows,
-    )
+    both = [(table, wanted)] if image is None else [(table, wanted), image]
+    centres = settings.centres // len(both)
+    if len(frames) > centres:
+        frames = frames[torch.linspace(0, len(frames) - 1, centres).round().long()]
+    outputs = torch.cat([states[frames] for _, states in both])
+    kernels, first = [], 0
+    for size in settings.input_sizes():
+        inputs = torch.cat([seen[frames, first : first + size] for seen, _ in both])
+        first += size
+        kernels.append(
+            fit_kernel_regression(
+                inputs,
+                outputs,
+                axes=settings.axes,
+                whitening=settings.whitening,
+                ridge=settings.ridge,
+                length=settings.length,
+                importance=importance,
+                metric_rows=settings.metric_rows,
+            )
+        )
+    return kernels
 
 
 def _importance(humanoid: HumanoidModel, state_std: Tensor) -> Tensor:

@@ -343,16 +343,18 @@ def save_finder(
 ) -> Path:
     """Keep a finder as a checkpoint folder: components ``finder``, ``config`` and ``card``.
 
-    ``config`` holds what loading needs: ``numbers``, ``channels``, ``names`` of the numbers, and ``flow``. ``card``
-    says what it was trained on and how well it does; no other file may lie in such a folder.
+    ``config`` holds what loading needs: ``numbers``, ``channels``, ``names`` of the numbers, their ``mirror``, and
+    ``flow``. ``card`` says what it was trained on and how well it does; no other file may lie in such a folder.
 
     Raises:
         SaveFailed: the disk is full or cannot be written to.
     """
+    mirror = posture_mirror(skeleton)
     config = {
         "numbers": model.numbers,
         "channels": model.mask.in_channels,
         "names": posture_names(skeleton),
+        "mirror": {"index": mirror.index.tolist(), "sign": mirror.sign.tolist()},
         "flow": asdict(flow),
     }
     return RunCheckpoint({"finder": model, "config": config, "card": dict(card)}).save(

@@ -56,6 +56,8 @@ class LimbFinder(nn.Module):
     mean: Tensor
     std: Tensor
     place: Tensor
+    mirror_index: Tensor
+    mirror_sign: Tensor
 
     def __init__(self, numbers: int, channels: int = 64) -> None:
         super().__init__()
@@ -79,6 +81,9 @@ class LimbFinder(nn.Module):
         self.register_buffer("place", torch.stack(torch.meshgrid(axis, axis, indexing="ij")), persistent=False)
         self.register_buffer("mean", torch.zeros(numbers))
         self.register_buffer("std", torch.ones(numbers))
+        # Of the numbers, not of the weights: saved beside them.
+        self.register_buffer("mirror_index", torch.arange(numbers), persistent=False)
+        self.register_buffer("mirror_sign", torch.ones(numbers), persistent=False)
 
     def forward(self, before: Tensor, now: Tensor, flow: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """What two frames show.
@@ -97,6 +102,14 @@ class LimbFinder(nn.Module):
         features = self.trunk(self.second(seen))
         posture, log_variance = self.posture(self.summary(features)).chunk(2, 1)
         return functional.pixel_shuffle(self.mask(features), 2), posture, log_variance.clamp(*_LOG_VARIANCE)
+
+    def mirrored_rows(self, rows: Tensor) -> Tensor:
+        """Rows ``[..., 2 Q]`` (:func:`limb_rows`) of a scene as rows of its mirror image, float32."""
+        posture, log_variance = rows.to(torch.float32).chunk(2, -1)
+        posture = self.mirror_sign * (posture * self.std + self.mean)[..., self.mirror_index]
+        # A variance is in squares of its number's own deviation.
+        scale = 2.0 * torch.log(self.std[self.mirror_index] / self.std)
+        return torch.cat([(posture - self.mean) / self.std, log_variance[..., self.mirror_index] + scale], -1)
 
 
 @functools.cache
@@ -119,6 +132,8 @@ def load_finder(name: str) -> LimbFinder:
         raise InputError("regressor.kernel", "limbs", f"no limb finder {name!r} comes with egopose")
     config = read_json(folder, "config")
     finder = LimbFinder(len(config["names"]), int(config["channels"]))
+    for key, buffer in (("index", finder.mirror_index), ("sign", finder.mirror_sign)):
+        buffer.copy_(torch.tensor(config["mirror"][key]))
     RunCheckpoint({"finder": finder}).restore(folder, {"finder"})
     return finder.eval()
 
