@@ -25,6 +25,7 @@ from egopose.errors import InputError
 from egopose.evaluation import metrics
 from egopose.evaluation.forecasting import ForecastWindow
 from egopose.material import Material
+from egopose.models.mirror import StateMirror
 from egopose.models.motion_forecast import spline_basis
 from egopose.motion import rotations as rot
 from egopose.motion_forecasts import FOLDER, begin_forecasts, with_futures
@@ -32,10 +33,18 @@ from egopose.ship import _copy_components
 from egopose.training.baselines import FitSettings, fit
 from egopose.training.checkpoint import ComponentState, RunCheckpoint, metadata_of
 from egopose.training.fragments import Span, cross_fit_blocks, group_blocks
-from egopose.training.motion_forecast import ForecasterSettings, ForecastLearner, build_forecaster, cross_fit_starts
+from egopose.training.motion_forecast import (
+    Contexts,
+    ForecasterSettings,
+    ForecastLearner,
+    build_forecaster,
+    cross_fit_starts,
+)
 
 FPS = 30.0
-SMALL: dict[str, Any] = {"recurrent": 8, "hidden": 16, "spacing": 3, "context": 5, "horizon": 12, "members": 2}
+SMALL: dict[str, Any] = {
+    "recurrent": 8, "hidden": 16, "spacing": 3, "context": 5, "horizon": 12, "members": 2, "kernel": None,
+}  # fmt: skip
 
 
 def settings(**changes: Any) -> ForecasterSettings:
@@ -128,7 +137,18 @@ def test_no_network_has_seen_what_it_forecasts_for_training(
 
 def learner(contexts: torch.Tensor, poses: torch.Tensor, **changes: Any) -> ForecastLearner:
     made = settings(input_noise=0.0, **changes)
-    return ForecastLearner(contexts, poses, [Span(0, len(poses))], [1], made, FPS, 8, 0.2, seed=0)
+    seen, span = contexts_of(contexts, made.context), Span(0, len(poses))
+    return ForecastLearner(seen, poses, [span], unmirrored(poses), [1], made, FPS, 8, 0.2, seed=0)
+
+
+def contexts_of(states: torch.Tensor, context: int) -> Contexts:
+    starts = torch.arange(context - 1, len(states))
+    return Contexts.at(states[starts[:, None] + torch.arange(1 - context, 1)], starts, len(states))
+
+
+def unmirrored(poses: torch.Tensor) -> StateMirror:
+    """Of a body that is its own mirror image."""
+    return StateMirror(torch.arange(poses.shape[1]), torch.ones(poses.shape[1]))
 
 
 def wave(frames: int, dofs: int = 4) -> torch.Tensor:

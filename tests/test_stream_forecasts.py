@@ -44,8 +44,8 @@ from egopose.stream import (
     still_frames,
     stream,
 )
-from egopose.training.checkpoint import RunCheckpoint, metadata_of
-from egopose.training.motion_forecast import ForecasterSettings, build_forecaster
+from egopose.training.checkpoint import ComponentState, RunCheckpoint, metadata_of
+from egopose.training.motion_forecast import ForecasterSettings, blank_kernel_forecaster, build_forecaster
 from egopose.training.predictions import torch_threads
 
 CONTEXT = 30
@@ -304,7 +304,11 @@ def following_run(trained: Trained, tmp_path_factory: pytest.TempPathFactory) ->
     values = {key: value for key, value in config["forecaster"].items() if key != "optimiser"}
     settings, pose = ForecasterSettings.from_config(values), 11 + trained.humanoid.mj_model.nu
     parts = [build_forecaster(settings, torch.zeros(pose), torch.ones(pose), 30.0, k) for k in range(settings.members)]
-    kept = {"members": torch.nn.ModuleList(parts)}
+    blank = blank_kernel_forecaster(settings, torch.zeros(pose), torch.ones(pose), 30.0, 4)
+    blank.kept.fill_(0.4)
+    sizes = {"centres": torch.tensor(4)}
+    kept: dict[str, Any] = {"members": torch.nn.ModuleList(parts), "kernel": blank}
+    kept["sizes"] = ComponentState(lambda: sizes, lambda _: None)
     RunCheckpoint(kept).save(folder / "forecaster", metadata=metadata_of("motion forecaster", pose, 0, 0, 0.0))
     material = still_futures(config, still_frames(trained.humanoid, trained.regressor, trained.made_with, 70))
     made = pipeline.build_run(config, folder, material)

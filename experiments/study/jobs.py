@@ -164,7 +164,8 @@ def _forecasts(
         # As the baselines: what the run's own state regressor sees in the contexts alone.
         pasts = past_states(agent, windows, "regressor")
         states = begin_forecasts(agent, windows, pasts)
-        futures = forecast_windows_of(agent, windows, states, 1, forecast, int(settings["threads"])).qpos
+        planner = planner_settings(settings.get("planner"))
+        futures = forecast_windows_of(agent, windows, states, 1, forecast, int(settings["threads"]), planner).qpos
     else:
         material = _material(folder, config, judged)
         baseline = load_baseline(folder)

@@ -26,6 +26,7 @@ from egopose.forecast_contexts import SOURCES, past_states
 from egopose.inference.bands import Bands, fit_scale, quantile_bands
 from egopose.inference.failsafe import FailSafeSettings
 from egopose.inference.forecaster import Forecasts, forecast
+from egopose.inference.planning import Planner, PlannerSettings, followed_futures, planner_settings
 from egopose.material import Material
 from egopose.models.baselines.recurrent import RecurrentForecaster
 from egopose.motion.io import write_motion
@@ -108,6 +109,7 @@ def run_forecast_evaluation(
     truth = _truth(material, windows)
     hands = [int(d) for d in humanoid.hand_dofs]
 
+    planner = planner_settings(config.get("planner"))
     methods: dict[str, list[Any]] = {OURS: [], DRAWN: [], STILL: []}
     coverage, futures = [], []
     others: dict[str, Array] = {}  # of the first run: [W, H, nq] of whatever it is compared with
@@ -118,7 +120,7 @@ def run_forecast_evaluation(
             methods[name] = [score_forecasts(truth, windows, told, hands, fps)]
             others[name] = told[:, 0]
         states = begin_forecasts(agent, windows, pasts)
-        mean = forecast_windows_of(agent, windows, states, 1, settings, int(config["threads"]))
+        mean = forecast_windows_of(agent, windows, states, 1, settings, int(config["threads"]), planner)
         methods[OURS].append(score_forecasts(truth, windows, mean.qpos, hands, fps))
         still = states[0].numpy()[:, None, None].repeat(windows[0].horizon, axis=2)
         methods[STILL].append(score_forecasts(truth, windows, still, hands, fps))
@@ -212,22 +214,31 @@ def forecast_windows_of(
     samples: int,
     settings: ForecastSettings,
     threads: int,
+    planner: PlannerSettings | None = None,
 ) -> Forecasts:
-    """:func:`egopose.inference.forecaster.forecast` of all windows, as many at a time as ``settings.worlds`` allow."""
+    """:func:`egopose.inference.forecaster.forecast` of all windows, as many at a time as ``settings.worlds`` allow.
+
+    A body that follows a kinematic forecast looks ahead where there is a planner; one that remembers does not, as a
+    planner's ways begin without a memory.
+    """
     parts, together = [], max(1, settings.worlds // samples)
     for at in range(0, len(windows), together):
         part = windows[at : at + together]
-        env = agent.make_env(
-            worlds=len(part) * samples,
-            threads=threads,
-            fragments=[window for window in part for _ in range(samples)],
-            whole_fragments=True,
-            falls_end=False,
-        )
+        options = {"threads": threads, "whole_fragments": True, "falls_end": False}
+        drawn = [window for window in part for _ in range(samples)]
+        env = agent.make_env(worlds=len(drawn), fragments=drawn, **options)
         qpos, qvel = (state[at : at + together] for state in states)
         horizon, seed = part[0].horizon, settings.seed + at
-        parts.append(forecast(env, agent.actor, qpos, qvel, samples, horizon, seed, settings.noise_time))
+        ahead, futures = None, agent.material.futures
+        if planner is not None and futures is not None:
+            now = torch.tensor([int(agent.material.takes.offsets[w.take]) + w.now for w in part])
+            copies = agent.make_env(worlds=len(part) * planner.samples, fragments=part, **options)
+            followed, row = followed_futures(futures, now)
+            ahead = Planner(copies, agent.actor, agent.critic, followed, planner, row)
+        parts.append(forecast(env, agent.actor, qpos, qvel, samples, horizon, seed, settings.noise_time, ahead))
         env.close()
+        if ahead is not None:
+            ahead.close()
     return Forecasts(*(np.concatenate([getattr(p, name) for p in parts]) for name in ("qpos", "fallen", "diverged")))
 
 

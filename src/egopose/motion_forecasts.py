@@ -10,14 +10,14 @@ import os
 import shutil
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor, nn
 
-from egopose.data.preparation import global_spans, store_folder
+from egopose.data.preparation import flow_name, global_spans, store_folder
 from egopose.data.splits import split_takes
 from egopose.data.store import TakeStore
 from egopose.envs.futures import Futures
@@ -27,16 +27,37 @@ from egopose.evaluation.forecasting import ForecastWindow
 from egopose.humanoid.soles import out_of_floor
 from egopose.inference.forecaster import placed_states
 from egopose.material import Material
-from egopose.models.motion_forecast import MotionForecaster, spline_basis
+from egopose.models.mirror import state_mirror
+from egopose.models.motion_forecast import KernelForecaster, MotionForecaster, spline_basis
+from egopose.regression import training_contexts
 from egopose.training.baselines import FitSettings, fit
 from egopose.training.checkpoint import ComponentState, RunCheckpoint, has_component, metadata_of
 from egopose.training.fragments import Span, cross_fit_blocks, group_blocks
-from egopose.training.motion_forecast import ForecasterSettings, ForecastLearner, build_forecaster, cross_fit_starts
+from egopose.training.motion_forecast import (
+    Contexts,
+    ForecasterSettings,
+    ForecastLearner,
+    blank_kernel_forecaster,
+    build_forecaster,
+    cross_fit_starts,
+    fit_kernel_forecaster,
+)
 
 if TYPE_CHECKING:
     from egopose.pipeline import Agent
 
 FOLDER = "forecaster"
+#: Components of that folder that forecasts are made by; ``futures`` are those of the training frames.
+PARTS = ("members", "kernel", "sizes")
+
+
+@dataclass(frozen=True)
+class Members:
+    """A forecaster's parts: ``(1 - share) * mean of the networks' curves + share * the kernel's``."""
+
+    networks: list[MotionForecaster]
+    kernel: KernelForecaster | None
+    share: float
 
 
 def with_futures(config: Mapping[str, Any], material: Material, run: Path) -> Material:
@@ -119,7 +140,7 @@ class ForecastCurves:
         self._members = _members(settings, run / FOLDER, self._size, _fps(material))
 
     def __call__(self, pasts: Tensor) -> Tensor:
-        return _curves(self._members, self._members[0].normalise(pasts[..., : self._size]))
+        return _curves(self._members, pasts[..., : self._size].float())
 
 
 def _settings(config: Mapping[str, Any]) -> tuple[ForecasterSettings, FitSettings]:
@@ -143,11 +164,17 @@ def _futures(material: Material, settings: ForecasterSettings, coefficients: Ten
 
 
 @torch.no_grad()
-def _curves(members: Sequence[MotionForecaster], contexts: Tensor) -> Tensor:
-    """Mean curve of the members ``[W, K, P]`` in the pose's own units, from contexts ``[W, C, P]`` in deviations."""
-    mean, std = members[0].mean, members[0].std
-    parts = [torch.stack([member(part) for member in members]).mean(0) for part in contexts.split(512)]
-    return torch.cat(parts) * std + mean
+def _curves(members: Members, contexts: Tensor) -> Tensor:
+    """Curve of the members ``[W, K, P]`` from contexts ``[W, C, P]``, in the pose's own units."""
+    return torch.cat([_curve(members, part) for part in contexts.split(512)])
+
+
+def _curve(members: Members, contexts: Tensor) -> Tensor:
+    def of(member: MotionForecaster | KernelForecaster) -> Tensor:
+        return member((contexts - member.mean) / member.std) * member.std + member.mean
+
+    curve = torch.stack([of(network) for network in members.networks]).mean(0)
+    return curve if members.kernel is None else torch.lerp(curve, of(members.kernel), members.share)
 
 
 def _train(config: Mapping[str, Any], material: Material, folder: Path) -> None:
@@ -158,17 +185,24 @@ def _train(config: Mapping[str, Any], material: Material, folder: Path) -> None:
     store = TakeStore.open(store_folder(config))
     pieces = split_takes(store.takes, config["data"]["split"], "train", supported_only=False)
     spans = [Span(*span) for span in global_spans(store, pieces)]
-    truth, seen = humanoid_state(material.reference).float(), material.states
     size = _size(material)
-    truth, seen = truth[:, :size], seen[:, :size]
+    truth = humanoid_state(material.reference).float()[:, :size]
+    # No shorter than the least context: a stretch without one has nothing to say.
+    ends = [torch.arange(s.start + settings.context - 1, s.stop) for s in spans]
+    starts = torch.cat([torch.zeros(0, dtype=torch.int64), *ends])
+    rows = training_contexts(config, store, material.humanoid, flow_name(config), starts, settings.context)[..., :size]
+    seen = Contexts.at(rows, starts, len(truth))
+    mirror = state_mirror(material.humanoid.skeleton).poses()
     hands, seed, fps = [int(d) for d in material.humanoid.hand_dofs], int(config["seed"]), _fps(material)
 
-    def members(fragments: Sequence[Span], label: str) -> list[MotionForecaster]:
+    def members(fragments: Sequence[Span], label: str) -> Members:
         out: list[MotionForecaster] = []
         for number in range(settings.members):
             share = optimiser.validation_share
             draw = seed * 1000 + number
-            learner = ForecastLearner(seen, truth, fragments, hands, settings, fps, optimiser.batch, share, draw)
+            learner = ForecastLearner(
+                seen, truth, fragments, mirror, hands, settings, fps, optimiser.batch, share, draw
+            )
             result = fit(learner, optimiser, draw, settings.total_frames)
             print(
                 f"forecaster{label} {number}: held out E_pose {result.held_out:.3f} after {result.frames} frames",
@@ -176,32 +210,43 @@ def _train(config: Mapping[str, Any], material: Material, folder: Path) -> None:
                 flush=True,
             )
             out.append(learner.model)
-        return out
+        if settings.kernel is None:
+            return Members(out, None, 0.0)
+        kernel = fit_kernel_forecaster(seen, truth, fragments, mirror, settings, fps)
+        return Members(out, kernel, settings.kernel.share)
 
     blocks = cross_fit_blocks(spans, settings.cross_fit)
     if config["data"]["split"]["kind"] == "subject":
         blocks = group_blocks(spans, [store.takes[piece.take].subject for piece in pieces], settings.cross_fit)
     whole = members(spans, "")
-    coefficients, starts = [], []
+    coefficients, begun = [], []
     for fold, (others, now) in enumerate(cross_fit_starts(spans, blocks, settings)):
         if len(now):
             fitted = members(others, f" without block {fold}")
-            rows = seen[now[:, None] + torch.arange(1 - settings.context, 1)]
-            coefficients.append(_curves(fitted, fitted[0].normalise(rows)))
-            starts.append(now)
-    table = {"coefficients": torch.cat(coefficients), "starts": torch.cat(starts)}
-    network = nn.ModuleList(whole)
+            coefficients.append(_curves(fitted, seen[now]))
+            begun.append(now)
+    table = {"coefficients": torch.cat(coefficients), "starts": torch.cat(begun)}
     part = folder.with_name(f"{FOLDER}.part")
     shutil.rmtree(part, ignore_errors=True)
-    made = {"members": network, "futures": ComponentState(lambda: table, lambda _: None)}
+    made: dict[str, Any] = {"members": nn.ModuleList(whole.networks)}
+    made["futures"] = ComponentState(lambda: table, lambda _: None)
+    if whole.kernel is not None:
+        sizes = {"centres": torch.tensor(len(whole.kernel.kernel.centres))}
+        made["kernel"], made["sizes"] = whole.kernel, ComponentState(lambda: sizes, lambda _: None)
     RunCheckpoint(made).save(part, metadata=metadata_of("motion forecaster", size, 0, 0, 0.0))
     os.replace(part, folder)
 
 
-def _members(settings: ForecasterSettings, folder: Path, size: int, fps: float) -> list[MotionForecaster]:
+def _members(settings: ForecasterSettings, folder: Path, size: int, fps: float) -> Members:
     zero, one = torch.zeros(size), torch.ones(size)
-    members = [build_forecaster(settings, zero, one, fps, 0) for _ in range(settings.members)]
-    network = nn.ModuleList(members)
-    RunCheckpoint({"members": network}).restore(folder, {"members"})
-    network.eval()
-    return members
+    networks = [build_forecaster(settings, zero, one, fps, 0) for _ in range(settings.members)]
+    parts: dict[str, Any] = {"members": nn.ModuleList(networks)}
+    kernel = None
+    if settings.kernel is not None:
+        sizes: dict[str, Tensor] = {}
+        RunCheckpoint({"sizes": ComponentState(dict, sizes.update)}).restore(folder, {"sizes"})
+        kernel = parts["kernel"] = blank_kernel_forecaster(settings, zero, one, fps, int(sizes["centres"]))
+    RunCheckpoint(parts).restore(folder, set(parts))
+    for part in parts.values():
+        part.eval()
+    return Members(networks, kernel, 0.0 if settings.kernel is None else settings.kernel.share)

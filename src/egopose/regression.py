@@ -34,7 +34,7 @@ from egopose.models.kernel_regression import KernelRegression
 from egopose.models.mirror import state_mirror
 from egopose.models.regressor import StateRegressor
 from egopose.sight import finder_fingerprint, finder_of, seen_in_store
-from egopose.training.blending import KernelSettings, blend
+from egopose.training.blending import KernelSettings, blend, past_contexts
 from egopose.training.checkpoint import CHECKSUMS, ComponentState, RunCheckpoint, metadata_of, read_json, verify
 from egopose.training.fragments import Span, cross_fit_blocks, group_blocks, without_block
 from egopose.training.predictions import Flow, predict_takes
@@ -289,6 +289,51 @@ def _blend(
         sizes["finder"] = finder_fingerprint(finder)
     card = {**store.table_card(network_name), "shares": blended.shares, "centres": centres}
     _keep(store, name, blended.model, tables, sizes, card)
+
+
+def training_contexts(
+    config: Mapping[str, Any],
+    store: TakeStore,
+    humanoid: HumanoidModel,
+    flow_name: str,
+    starts: Tensor,
+    context: int,
+) -> Tensor:
+    """States z ``[N, context, S]`` that a store's regressor, blind to those frames, sees up to each of them.
+
+    Those of a blended regressor are :func:`egopose.training.blending.past_contexts`; of a network alone, which looks
+    less far ahead, they are its cross-fitted states of the whole takes.
+
+    Args:
+        config: resolved; whose regressor is trained already.
+        store: with flow.
+        humanoid: whose states they are.
+        flow_name: the flow's name in the store.
+        starts: ``[N]`` training frames, the contexts' last.
+        context: frames.
+
+    Raises:
+        InputError: the regressor is not there or damaged.
+    """
+    tables, weights = regressor_tables(config, store, humanoid, flow_name)
+    network_config = _network_config(config)
+    if network_config is None:
+        return tables["humanoid_state"][starts[:, None] + torch.arange(1 - context, 1)].float()
+    print(f"regressing {len(starts)} contexts", file=sys.stderr, flush=True)
+    return past_contexts(
+        load_regressor(weights)[0],
+        store.table(regressor_name(network_config, store, flow_name))["humanoid_state"],
+        seen_in_store(config, config["regressor"], store, flow_name, keep=True),
+        humanoid_state(store.reference),
+        _whole_takes(store),
+        _training_spans(config, store),
+        _blocks(config, store),
+        humanoid,
+        _settings(config),
+        _kernel_settings(config),
+        starts,
+        context,
+    )
 
 
 def _save_part(part: Path, state: State) -> None:

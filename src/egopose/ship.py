@@ -55,7 +55,9 @@ def ship(values: Mapping[str, Any]) -> Path:
             raw result is wrong.
     """
     from egopose import weights
-    from egopose.training.checkpoint import FOLDER, find_checkpoint, read_json, seal
+    from egopose.motion_forecasts import FOLDER as FORECASTER
+    from egopose.motion_forecasts import PARTS
+    from egopose.training.checkpoint import FOLDER, find_checkpoint, has_component, read_json, seal
 
     run, name = Path(str(values["run"])), str(values["name"])
     if not re.fullmatch(r"[a-z][a-z0-9_]*", name):
@@ -72,8 +74,9 @@ def ship(values: Mapping[str, Any]) -> Path:
         if not (run / "regressor").is_dir():
             raise InputError(run, "regressor", "is missing: the policy cannot see without it")
         shutil.copytree(run / "regressor", part / "regressor")
-        if (run / "forecaster").is_dir():
-            _copy_components(run / "forecaster", part / "forecaster", ("members",))
+        if (run / FORECASTER).is_dir():
+            kept = [one for one in PARTS if has_component(run / FORECASTER, one)]
+            _copy_components(run / FORECASTER, part / FORECASTER, kept)
         if (run / "provenance.json").is_file():
             shutil.copyfile(run / "provenance.json", part / "provenance.json")
         about = _about(values, run, checkpoint, config)

@@ -20,6 +20,7 @@ from egopose.envs.env import EgoPoseEnv
 from egopose.humanoid.model import HumanoidModel
 from egopose.humanoid.soles import out_of_floor
 from egopose.inference.estimator import Controller, prepare_for_test
+from egopose.inference.planning import Planner
 from egopose.models.pose_regression import state_to_qpos
 from egopose.motion import rotations as rot
 from egopose.motion.rotations import Array
@@ -50,6 +51,7 @@ def forecast(
     horizon: int = 90,
     seed: int = 0,
     noise_time: float = 0.0,
+    planner: Planner | None = None,
 ) -> Forecasts:
     """Roll the policy out from the given states.
 
@@ -66,6 +68,7 @@ def forecast(
         seed: of the drawn actions; torch's own generator is left as it was.
         noise_time: s in which the correlation of a drawn action's noise falls to 1/e; 0 for independent steps, as the
             policy was trained with.
+        planner: of as many bodies, for the mean action; None for the policy alone.
 
     Raises:
         ValueError: the environment has not ``W * samples`` worlds, or a count is not positive.
@@ -88,6 +91,8 @@ def forecast(
     with set_exploration_type(ExplorationType.DETERMINISTIC):
         for _ in range(horizon):
             observation = actor(observation)
+            if planner is not None:
+                observation["action"] = observation["action"] + planner.addition(base)
             if samples > 1:
                 observation["action"] = observation["loc"] + observation["scale"] * noise
                 fresh = torch.randn(noise.shape, generator=generator)

@@ -3,12 +3,13 @@
 The body that acts a video out is simulated anyway, so what an action leads to can be tried before it is taken
 (predictive sampling: Howell et al. 2022, arXiv 2212.00541; the policy's value at the horizon's end: Lowrey et al. 2019,
 POLO). A way to go on is the policy's mean action plus an addition that changes smoothly; the policy reacts in each.
-What they are judged by is what the body follows, the state regressor's motion; the true motion plays no part.
+What they are judged by is what the body follows, the state regressor's motion or a kinematic forecast; the true motion
+plays no part.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from types import SimpleNamespace
 from typing import Any
@@ -21,13 +22,45 @@ from torchrl.envs import TransformedEnv
 
 from egopose.envs.env import EgoPoseEnv
 from egopose.envs.forecasting import RecurrentStates
+from egopose.envs.futures import Futures
 from egopose.envs.mdp.rewards import Reward, build_reward
 from egopose.envs.transformed import Entries, parts_of, run_parts
 from egopose.errors import InputError
 from egopose.models.pose_regression import state_to_qpos
 
 _EPISODE = ("take", "start", "stop", "frame")  # with one number for each body
+Rows = Callable[[Mapping[str, Tensor]], Tensor]
+"""Of what an environment writes: which row of what is followed each body should be in, ``[N]`` int64."""
+
 _BROKEN = 1000.0  # what a way loses whose physics break: more than any sum of rewards
+
+
+def global_frame(entries: Mapping[str, Tensor]) -> Tensor:
+    """The row of a table of all frames."""
+    return entries["frame"].squeeze(-1)
+
+
+def followed_futures(futures: Futures, starts: Tensor) -> tuple[Tensor, Rows]:
+    """What bodies follow that follow the forecasts from these frames.
+
+    Args:
+        futures: forecasts.
+        starts: ``[W]`` global frames, each once.
+
+    Returns:
+        States z ``[W * (horizon + 1), S]`` of every step, and the rows of a body in its episode; behind the horizon the
+        last.
+    """
+    steps = torch.arange(futures.horizon + 1)
+    states = futures.states(starts.repeat_interleave(len(steps)), steps.repeat(len(starts)))
+    number = torch.full((futures.frames,), -1, dtype=torch.int64)
+    number[starts] = torch.arange(len(starts))
+
+    def row(entries: Mapping[str, Tensor]) -> Tensor:
+        start, step = entries["episode_start"].squeeze(-1), entries["episode_step"].squeeze(-1)
+        return number[start] * len(steps) + step.clamp(max=futures.horizon)
+
+    return states, row
 
 
 @dataclass(frozen=True)
@@ -88,8 +121,10 @@ class Planner:
             frozen.
         actor, critic: policy and value network, in evaluation mode; sequences of modules that read and write plain
             entries.
-        states: ``[F, 2 nq - 3]`` the regressor's humanoid state of every global frame, as the policy follows it.
+        states: ``[R, 2 nq - 3]`` the humanoid states the policy follows: the regressor's of every global frame, or
+            :func:`followed_futures`.
         settings: see :class:`PlannerSettings`.
+        row: which of them.
 
     Attributes:
         value: ``[N]`` what the best way was worth: discounted rewards and, at the horizon, V.
@@ -105,6 +140,7 @@ class Planner:
         critic: TensorDictModuleBase,
         states: Tensor,
         settings: PlannerSettings,
+        row: Rows = global_frame,
     ) -> None:
         base = env.base_env
         assert isinstance(base, EgoPoseEnv)
@@ -115,7 +151,7 @@ class Planner:
             )
         if any(isinstance(part, RecurrentStates) for part in env.transform):
             raise InputError("planner", "model.memory", "a planner's ways begin without a memory: planner=none")
-        self.settings, self._env, self._base = settings, env, base
+        self.settings, self._env, self._base, self._row = settings, env, base, row
         # The mean is what a deterministic policy does: no need of the distribution behind it.
         gaussian = isinstance(actor, ProbabilisticTensorDictSequential)
         self._actor = [part for step in (actor.module[:-1] if gaussian else [actor]) for part in parts_of(step)]
@@ -193,10 +229,10 @@ class Planner:
         for step in range(settings.horizon):
             run_parts(self._actor, seen)
             body, after = copies.try_step(seen[self._action] + ways[:, :, step].flatten(0, 1))
-            frame = after["frame"].squeeze(-1)
-            followed = SimpleNamespace(**{name: rows.index_select(0, frame) for name, rows in self._followed.items()})
+            row = self._row(after)
+            followed = SimpleNamespace(**{name: rows.index_select(0, row) for name, rows in self._followed.items()})
             reward, _ = self._reward(body, followed, after["episode_step"].squeeze(-1))
-            low = (self._head_height[frame] - body.xpos[:, problem.humanoid.head, 2]).clamp(min=0.0)
+            low = (self._head_height[row] - body.xpos[:, problem.humanoid.head, 2]).clamp(min=0.0)
             now = body.qvel.numpy()
             acceleration = torch.from_numpy(np.abs(now - velocity).mean(1) * rate)
             velocity = now

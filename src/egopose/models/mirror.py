@@ -30,6 +30,11 @@ class StateMirror:
         """Mirror image of states z ``[..., S]``."""
         return state[..., self.index] * self.sign
 
+    def poses(self) -> StateMirror:
+        """The mirror of a state's first numbers, which are its pose: all but the joints' velocities."""
+        size = 11 + (len(self.index) - 11) // 2
+        return StateMirror(self.index[:size], self.sign[:size])
+
     @staticmethod
     def flow(flow: Tensor) -> Tensor:
         """Mirror image of flow ``[..., 2, H, W]`` (channel 0 points right)."""

@@ -10,10 +10,14 @@ angles, root linear velocity (heading frame) and root angular velocity (root fra
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import torch
 from scipy.interpolate import BSpline
 from torch import Tensor, nn
+
+from egopose.models.kernel_regression import KernelRegression
 
 
 def spline_basis(frames: int, spacing: int, fps: float) -> tuple[Tensor, Tensor]:
@@ -79,4 +83,38 @@ class MotionForecaster(nn.Module):
         """Context ``[B, C, P]`` in deviations -> coefficients ``[B, K, P]``."""
         seen, _ = self.gru(context)
         added = self.head(seen[:, -1]).unflatten(-1, self.kept.shape[1:])
+        return context[:, -1:] * self.kept[0] + context.mean(dim=1, keepdim=True) * self.kept[1] + added
+
+
+class KernelForecaster(nn.Module):
+    """As :class:`MotionForecaster`, but that moments of training like the context add to the shares of its poses.
+
+    Args:
+        mean, std: ``[P]``, see :class:`MotionForecaster`.
+        bins: the context's frames from the last one back, in so many parts, whose mean poses are compared.
+        coefficients: K.
+        kernel: ``[bins * P]`` -> ``[K * P]``.
+    """
+
+    mean: Tensor
+    std: Tensor
+    kept: Tensor
+
+    def __init__(
+        self, mean: Tensor, std: Tensor, bins: Sequence[int], coefficients: int, kernel: KernelRegression
+    ) -> None:
+        super().__init__()
+        self.register_buffer("mean", mean.to(torch.float32))
+        self.register_buffer("std", std.to(torch.float32))
+        #: ``[2, K, P]``: shares of the last and of the mean pose.
+        self.register_buffer("kept", torch.zeros(2, coefficients, len(mean)))
+        self.bins, self.kernel = tuple(bins), kernel
+
+    def parts(self, context: Tensor) -> Tensor:
+        """Mean poses of the parts of contexts ``[B, C, P]``, the latest first, ``[B, bins * P]``."""
+        return torch.cat([part.mean(1) for part in context.flip(1).split(self.bins, dim=1)], dim=-1)
+
+    def forward(self, context: Tensor) -> Tensor:
+        """Context ``[B, C, P]`` in deviations -> coefficients ``[B, K, P]``."""
+        added = self.kernel(self.parts(context)).unflatten(-1, self.kept.shape[1:])
         return context[:, -1:] * self.kept[0] + context.mean(dim=1, keepdim=True) * self.kept[1] + added

@@ -26,6 +26,8 @@ from egopose.training.regressor_settings import RegressorSettings
 from egopose.vision.encoders import FLOW_CHANNELS
 from egopose.vision.limbs import load_finder
 
+_CONTEXTS = 64  # contexts that are regressed together
+
 
 @dataclass(frozen=True)
 class KernelSettings:
@@ -133,10 +135,7 @@ def blend(
     """
     with torch_threads(settings.threads):
         seen = window_table(flow, takes, kernel_settings, settings.encode_batch)
-        image = None
-        if kernel_settings.mirror:
-            table = window_table(flow, takes, kernel_settings, settings.encode_batch, mirrored=True)
-            image = (table, network.normalise(state_mirror(humanoid.skeleton).state(states)))
+        image = _image(flow, takes, states, network, humanoid, kernel_settings, settings.encode_batch)
         wanted, by_network = network.normalise(states), network.normalise(crossed_states)
         by_kernel = torch.zeros_like(wanted)
         importance = _importance(humanoid, network.state_std)
@@ -162,6 +161,74 @@ def blend(
 
 
 @torch.no_grad()
+def past_contexts(
+    model: StateRegressor,
+    crossed_states: Tensor,
+    flow: Flow,
+    states: Tensor,
+    takes: Sequence[Span],
+    fragments: Sequence[Span],
+    blocks: Sequence[Sequence[Span]],
+    humanoid: HumanoidModel,
+    settings: RegressorSettings,
+    kernel_settings: KernelSettings,
+    starts: Tensor,
+    context: int,
+) -> Tensor:
+    """What is known at a training frame of it and the frames before, by kernels that have not seen them.
+
+    A blended F looks ahead: a forecast learned from what it says of whole takes would know of what it forecasts. Of
+    the network, whose cross-fitted forms are not kept, the states of whole takes stand in.
+
+    Args:
+        model: the blended F.
+        crossed_states, flow, states, takes, fragments, blocks, humanoid, settings, kernel_settings: as for
+            :func:`blend`.
+        starts: ``[N]`` global frames of the blocks, the last ones of contexts that lie in their take.
+        context: frames.
+
+    Returns:
+        ``[N, context, S]`` states z, each row as if its last frame were the clip's.
+    """
+    with torch_threads(settings.threads):
+        seen = window_table(flow, takes, kernel_settings, settings.encode_batch)
+        wanted, by_network = model.normalise(states), model.normalise(crossed_states)
+        image = _image(flow, takes, states, model, humanoid, kernel_settings, settings.encode_batch)
+        importance, windows = _importance(humanoid, model.state_std), kernel_settings.windows()
+        views = view_table(flow, takes, kernel_settings, settings.encode_batch)
+        out = torch.zeros(len(starts), context, len(model.state_std))
+        margin = max(settings.margin, context)
+        for block in blocks:
+            mine = torch.cat([((starts >= s.start) & (starts < s.stop)).nonzero()[:, 0] for s in block])
+            others = without_block(fragments, block, margin, margin)
+            kernels = fit_kernels(seen, wanted, others, kernel_settings, importance, image)
+            for kernel in kernels:
+                kernel.exact = False
+            left_out = MeanOfKernels(kernels)
+            for part in mine.split(_CONTEXTS):
+                frames = starts[part, None] + torch.arange(1 - context, 1)
+                by_kernel = left_out(windows(windows.pad(views[frames])))
+                out[part] = model.head.network_share * by_network[frames] + model.head.kernel_share * by_kernel
+    return out * model.state_std + model.state_mean
+
+
+def _image(
+    flow: Flow,
+    takes: Sequence[Span],
+    states: Tensor,
+    model: StateRegressor,
+    humanoid: HumanoidModel,
+    settings: KernelSettings,
+    batch: int,
+) -> tuple[Tensor, Tensor] | None:
+    """What the kernels see of the mirrored scene and its states in normalised units; None where it is not learned."""
+    if not settings.mirror:
+        return None
+    table = window_table(flow, takes, settings, batch, mirrored=True)
+    return table, model.normalise(state_mirror(humanoid.skeleton).state(states))
+
+
+@torch.no_grad()
 def window_table(
     flow: Flow, takes: Sequence[Span], settings: KernelSettings, batch: int, mirrored: bool = False
 ) -> Tensor:
@@ -175,19 +242,24 @@ def window_table(
         mirrored: of the scene's mirror image.
     """
     windows = settings.windows()
-    rows = torch.zeros(len(flow), 0)
+    views = view_table(flow, takes, settings, batch, mirrored)
+    rows = torch.zeros(len(flow), windows.count * views.shape[1])
     for span in takes:
-        parts = [np.arange(at, min(at + batch, span.stop)) for at in range(span.start, span.stop, batch)]
-        cells = torch.cat(
-            [kernel_view(take_frames(flow, part), settings.cells, settings.limb_numbers) for part in parts]
-        )
-        if mirrored:
-            cells = mirrored_view(cells, settings)
-        seen = windows(windows.pad(cells[None]))[0]
-        if not rows.shape[1]:
-            rows = torch.zeros(len(flow), seen.shape[1])
-        rows[span.start : span.stop] = seen
+        rows[span.start : span.stop] = windows(windows.pad(views[None, span.start : span.stop]))[0]
     return rows
+
+
+@torch.no_grad()
+def view_table(
+    flow: Flow, takes: Sequence[Span], settings: KernelSettings, batch: int, mirrored: bool = False
+) -> Tensor:
+    """As :func:`window_table`, each frame by itself: ``[F, 2 cells^2 + limbs]``."""
+    rows = torch.zeros(len(flow), FLOW_CHANNELS * settings.cells**2 + settings.limb_numbers)
+    for span in takes:
+        for at in range(span.start, span.stop, batch):
+            part = np.arange(at, min(at + batch, span.stop))
+            rows[part] = kernel_view(take_frames(flow, part), settings.cells, settings.limb_numbers)
+    return mirrored_view(rows, settings) if mirrored else rows
 
 
 def mirrored_view(view: Tensor, settings: KernelSettings) -> Tensor:

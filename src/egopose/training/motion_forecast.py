@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -12,9 +12,46 @@ from torch import Tensor
 
 from egopose.config import from_mapping
 from egopose.errors import InputError
-from egopose.models.motion_forecast import MotionForecaster, spline_basis
+from egopose.models.kernel_regression import KernelRegression, fit_kernel_regression
+from egopose.models.mirror import StateMirror
+from egopose.models.motion_forecast import KernelForecaster, MotionForecaster, spline_basis
 from egopose.models.regressor import state_statistics
 from egopose.training.fragments import Span, split_validation, without_block
+
+
+@dataclass(frozen=True)
+class KernelSettings:
+    """The group ``kernel`` of ``conf/forecaster``.
+
+    Args:
+        bins: see :class:`KernelForecaster`; they add up to the context.
+        axes, whitening, ridge, length: see :func:`egopose.models.kernel_regression.fit_kernel_regression`.
+        centres: moments of training remembered at most, evenly chosen; half of them are mirror images.
+        share: of its curve; the rest is the networks'.
+        least: frames of the future that a moment must have to be remembered; a take's last pose stands for the rest.
+        kept_ridge: of the shares of last and mean pose, in their variance.
+    """
+
+    bins: tuple[int, ...]
+    axes: int
+    whitening: float
+    ridge: float
+    length: float
+    centres: int
+    share: float
+    least: int
+    kept_ridge: float
+
+    def __post_init__(self) -> None:
+        def check(ok: bool, name: str, cause: str) -> None:
+            if not ok:
+                raise InputError("conf/forecaster kernel", name, cause)
+
+        check(bool(self.bins) and min(self.bins) > 0, "bins", "must be positive")
+        check(self.axes > 0 and self.least > 0, "axes", "must be positive, as must least")
+        check(min(self.ridge, self.length, self.kept_ridge) > 0, "ridge", "must be positive, as must the others")
+        check(self.centres >= 4, "centres", "must be at least 4")
+        check(0 < self.share < 1, "share", "must lie between 0 and 1")
 
 
 @dataclass(frozen=True)
@@ -32,6 +69,7 @@ class ForecasterSettings:
             people are held out for testing, else blocks of time.
         members: networks whose curves are averaged.
         total_frames: of motion each network learns from, counted as often as they are seen.
+        kernel: of the kernel regression beside the networks, or None for networks alone.
     """
 
     recurrent: int
@@ -46,11 +84,19 @@ class ForecasterSettings:
     cross_fit: int
     members: int
     total_frames: int
+    kernel: KernelSettings | None = None
 
     @classmethod
     def from_config(cls, values: Mapping[str, Any], source: str = "conf/forecaster") -> ForecasterSettings:
         """Raises InputError: a key is missing, unknown or out of range; names it."""
-        settings = from_mapping(cls, values, source)
+        own = {key: value for key, value in values.items() if key != "kernel"}
+        settings = from_mapping(cls, own, source)
+        if values.get("kernel") is not None:
+            kernel = from_mapping(KernelSettings, values["kernel"], f"{source} kernel")
+            settings = replace(settings, kernel=kernel)
+            if sum(kernel.bins) != settings.context:
+                cause = f"must add up to the context's {settings.context} frames, not {sum(kernel.bins)}"
+                raise InputError(f"{source} kernel", "bins", cause)
         if settings.context > settings.horizon:  # what is left out about a block is as wide as the horizon
             raise InputError(source, "context", f"must be at most the horizon, {settings.horizon} frames")
         least = {"recurrent": 1, "hidden": 1, "spacing": 1, "context": 1, "horizon": 2, "cross_fit": 2, "members": 1}
@@ -68,6 +114,97 @@ def build_forecaster(
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         return MotionForecaster(mean, std, settings.recurrent, settings.hidden, settings.dropout, count)
+
+
+def blank_kernel_forecaster(
+    settings: ForecasterSettings, mean: Tensor, std: Tensor, fps: float, centres: int = 0
+) -> KernelForecaster:
+    """One that knows nothing yet, for pose states of these statistics ``[P]`` and as many moments to remember."""
+    assert settings.kernel is not None
+    count, size = spline_basis(settings.horizon + 1, settings.spacing, fps)[0].shape[1], len(mean)
+    inputs = len(settings.kernel.bins) * size
+    kernel = KernelRegression(inputs, min(settings.kernel.axes, inputs), centres, count * size)
+    return KernelForecaster(mean, std, settings.kernel.bins, count, kernel)
+
+
+@dataclass(frozen=True)
+class Contexts:
+    """What has been seen up to some frames, pose states.
+
+    Args:
+        rows: ``[R, context, P]``.
+        row: ``[F]`` which of them ends at a frame, -1 for none.
+    """
+
+    rows: Tensor
+    row: Tensor
+
+    @classmethod
+    def at(cls, rows: Tensor, starts: Tensor, frames: int) -> Contexts:
+        """Rows of the frames ``starts [R]`` of ``frames``."""
+        row = torch.full((frames,), -1, dtype=torch.int64)
+        row[starts] = torch.arange(len(starts))
+        return cls(rows, row)
+
+    def __getitem__(self, now: Tensor) -> Tensor:
+        """``[B, context, P]`` up to the frames ``now [B]``, each of which has one."""
+        return self.rows[self.row[now]]
+
+
+def fit_kernel_forecaster(
+    contexts: Contexts,
+    poses: Tensor,
+    fragments: Sequence[Span],
+    mirror: StateMirror,
+    settings: ForecasterSettings,
+    fps: float,
+) -> KernelForecaster:
+    """The kernel forecaster of the contexts in ``fragments`` and their mirror images.
+
+    Args:
+        contexts: see :class:`ForecastLearner`.
+        poses: ``[F, P]`` true ones.
+        fragments: training stretches, in global frames.
+        mirror: of pose states.
+        settings: with a kernel's.
+        fps: frames per second.
+
+    Raises:
+        InputError: no fragment holds a context and the least of a future.
+    """
+    kernel = settings.kernel
+    assert kernel is not None
+    spans = [s for s in fragments if s.stop - s.start >= settings.context + kernel.least]
+    if not spans:
+        cause = f"none is longer than {settings.context} + {kernel.least} frames"
+        raise InputError("forecaster", "fragments", cause)
+    now = torch.cat([torch.arange(s.start + settings.context - 1, s.stop - kernel.least) for s in spans])
+    stop = torch.cat([torch.full((s.stop - s.start - settings.context - kernel.least + 1,), s.stop) for s in spans])
+    chosen = torch.linspace(0, len(now) - 1, min(kernel.centres // 2, len(now))).round().long()
+    now, stop = now[chosen], stop[chosen]
+    mean, std = state_statistics(torch.cat([poses[s.start : s.stop] for s in spans]), settings.std_floor)
+    model = blank_kernel_forecaster(settings, mean, std, fps)
+    basis = spline_basis(settings.horizon + 1, settings.spacing, fps)[0]
+    frames = torch.minimum(now[:, None] + torch.arange(len(basis)), stop[:, None] - 1)
+    seen = contexts[now]
+    seen, future = ((torch.cat([rows, mirror.state(rows)]) - model.mean) / model.std for rows in (seen, poses[frames]))
+    wanted = torch.linalg.pinv(basis) @ future
+    # Shares of the last and the mean pose, for each coefficient and number of its own.
+    given = torch.stack([seen[:, -1], seen.mean(1)], dim=-1)
+    square = torch.einsum("npa,npb->pab", given, given) / len(given)
+    square += kernel.kept_ridge * torch.diag_embed(square.diagonal(dim1=-2, dim2=-1)) + 1e-6 * torch.eye(2)
+    product = torch.einsum("npa,nkp->pak", given, wanted) / len(given)
+    model.kept.copy_(torch.linalg.solve(square, product).permute(1, 2, 0))
+    rest = wanted - torch.einsum("npa,akp->nkp", given, model.kept)
+    model.kernel = fit_kernel_regression(
+        model.parts(seen),
+        rest.flatten(1),
+        axes=kernel.axes,
+        whitening=kernel.whitening,
+        ridge=kernel.ridge,
+        length=kernel.length,
+    )
+    return model.eval()
 
 
 def cross_fit_starts(
@@ -102,9 +239,11 @@ class ForecastLearner:
     little of all else a body needs to follow it.
 
     Args:
-        contexts: ``[F, P]`` pose states as seen, by a state regressor that was not trained on the frame.
+        contexts: as seen, by a state regressor that was not trained on the frames, from every frame of the fragments
+            with so many before it.
         poses: ``[F, P]`` true ones.
         fragments: training stretches, in global frames; the held-out frames are cut from their ends.
+        mirror: of pose states: every other window is its mirror image.
         hands: columns of the joint angles that belong to the hands.
         settings: of the network.
         fps: frames per second.
@@ -118,9 +257,10 @@ class ForecastLearner:
 
     def __init__(
         self,
-        contexts: Tensor,
+        contexts: Contexts,
         poses: Tensor,
         fragments: Sequence[Span],
+        mirror: StateMirror,
         hands: Sequence[int],
         settings: ForecasterSettings,
         fps: float,
@@ -135,7 +275,8 @@ class ForecastLearner:
             raise InputError("forecaster", "fragments", f"none is longer than {settings.context} + 2 frames")
         rows = torch.cat([poses[a:b] for a, b in self.train.tolist()])
         self.model = build_forecaster(settings, *state_statistics(rows, settings.std_floor), fps, seed)
-        self.contexts, self.poses = self.model.normalise(contexts), self.model.normalise(poses)
+        self.contexts = Contexts(self.model.normalise(contexts.rows), contexts.row)
+        self.poses, self.mirror = self.model.normalise(poses), mirror
         self.basis = spline_basis(settings.horizon + 1, settings.spacing, fps)[0]
         self.judged, self.others = _scales(self.model.std, hands)
         self.windows = self._windows([span for span, _ in kept], settings.context)
@@ -145,11 +286,11 @@ class ForecastLearner:
         spans = self.train[self._draw(generator)]
         first, last = spans[:, 0] + self.settings.context - 1, spans[:, 1] - 2
         now = first + (torch.rand(self.batch, generator=generator) * (last - first + 1)).long()
-        seen = self._context(now)
+        seen, flip = self.contexts[now], torch.rand(self.batch, generator=generator) < 0.5
         scale = self.settings.input_noise
         seen = seen + scale * torch.randn(len(now), 1, seen.shape[-1], generator=generator)
         seen = seen + scale * torch.randn(seen.shape, generator=generator)
-        judged, others, inside = self._errors(seen, now, spans[:, 1])
+        judged, others, inside = self._errors(seen, now, spans[:, 1], flip)
         loss = (judged + self.settings.other_weight * others)[inside].mean()
         return loss, int(inside.sum()) + len(now) * (self.settings.context - 1)
 
@@ -158,20 +299,23 @@ class ForecastLearner:
         """E_pose, rad, of the curves from held-out contexts; NaN where there are none."""
         if not len(self.windows):
             return math.nan
-        judged, _, inside = self._errors(self._context(self.windows[:, 0]), *self.windows.unbind(1))
+        now, stops = self.windows.unbind(1)
+        judged, _, inside = self._errors(self.contexts[now], now, stops, torch.zeros(len(now), dtype=torch.bool))
         return float(judged[inside].mean())
 
-    def _errors(self, seen: Tensor, now: Tensor, stops: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def _errors(self, seen: Tensor, now: Tensor, stops: Tensor, flip: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """E_pose and the mean square of what it leaves out ``[B, T]``, and which frames the take has ``[B, T]``."""
-        curve = self.basis @ self.model(seen)
+        curve = self.basis @ self.model(self._mirrored(seen, flip))
         frames = now[:, None] + torch.arange(len(self.basis))
         inside = frames < stops[:, None]
-        error = curve - self.poses[torch.minimum(frames, stops[:, None] - 1)]
+        error = curve - self._mirrored(self.poses[torch.minimum(frames, stops[:, None] - 1)], flip)
         judged = ((error * self.judged).square().sum(-1) + 1e-6).sqrt()
         return judged, (error.square() * self.others).sum(-1) / self.others.sum(), inside
 
-    def _context(self, now: Tensor) -> Tensor:
-        return self.contexts[now[:, None] + torch.arange(1 - self.settings.context, 1)]
+    def _mirrored(self, poses: Tensor, flip: Tensor) -> Tensor:
+        """Rows ``[B, T, P]`` in deviations, their mirror images where ``flip [B]``."""
+        image = self.model.normalise(self.mirror.state(poses * self.model.std + self.model.mean))
+        return torch.where(flip[:, None, None], image, poses)
 
     def _draw(self, generator: torch.Generator) -> Tensor:
         """``[batch]`` fragments, each as often as forecasts can begin in it."""

@@ -132,6 +132,8 @@ def load_finder(name: str) -> LimbFinder:
         raise InputError("regressor.kernel", "limbs", f"no limb finder {name!r} comes with egopose")
     config = read_json(folder, "config")
     finder = LimbFinder(len(config["names"]), int(config["channels"]))
+    if "mirror" not in config:
+        raise InputError(folder, "mirror", "is missing: the finder was made by an older egopose")
     for key, buffer in (("index", finder.mirror_index), ("sign", finder.mirror_sign)):
         buffer.copy_(torch.tensor(config["mirror"][key]))
     RunCheckpoint({"finder": finder}).restore(folder, {"finder"})
