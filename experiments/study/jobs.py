@@ -34,6 +34,7 @@ from egopose.motion.rotations import Array
 from egopose.motion_forecasts import begin_forecasts
 from egopose.pipeline import Agent, load_agent
 from egopose.regression import load_regressor
+from egopose.sight import seen_in_store
 from egopose.train import run_job as train_job
 from egopose.training.logging import write_provenance
 
@@ -188,10 +189,11 @@ def _forecasts(
 def _contexts(material: Material, config: dict[str, Any], windows: Sequence[ForecastWindow]) -> torch.Tensor:
     """``[W, context, S]``: what the state regressor sees in the frames of each context alone."""
     assert material.regressor is not None
-    model, _ = load_regressor(material.regressor)
-    flow = TakeStore.open(store_folder(config)).flow(flow_name(config))
+    model, made_with = load_regressor(material.regressor)
+    store = TakeStore.open(store_folder(config))
+    seen = seen_in_store(config, made_with["regressor"], store, flow_name(config))
     first = [int(material.takes.offsets[w.take]) + w.start for w in windows]
-    return context_states(model, flow, first, windows[0].context)
+    return context_states(model, seen, first, windows[0].context)
 
 
 def _truth(material: Material, windows: Sequence[ForecastWindow]) -> Array:

@@ -65,7 +65,7 @@ PAPER: dict[str, dict[str, float]] = {
 }
 #: Table 2, cross subject: N_reset, E_pose, E_vel, A_accl.
 PAPER_ABLATIONS = {
-    "ours": (4, 1.183, 5.645, 5.260),
+    "no_planner": (4, 1.183, 5.645, 5.260),
     "pose_and_end_effectors": (55, 1.211, 5.730, 5.515),
     "pose_only": (14, 1.236, 6.468, 8.167),
     "deepmimic": (52, 1.515, 7.413, 17.504),
@@ -242,7 +242,10 @@ def _fallen(scores: Scores, folds: Sequence[str], seeds: Sequence[int]) -> str:
 
 
 def ablation_table(found: Mapping[tuple[str, str], Scores]) -> list[str]:
-    """Table 2, as Markdown: on the folds and seeds that all its rows have, or its order would be that of the takes."""
+    """Table 2, as Markdown: on the folds and seeds that all its rows have, or its order would be that of the takes.
+
+    All rows are the policy alone, without a planner, as in the paper.
+    """
     lines = _header(["", "resets", "E_pose", "E_vel", "A_accl", "paper: resets", "E_pose", "E_vel", "A_accl"])
     rows = {method: found["cross", method] for method in PAPER_ABLATIONS if ("cross", method) in found}
     if not rows:
@@ -255,10 +258,11 @@ def ablation_table(found: Mapping[tuple[str, str], Scores]) -> list[str]:
         paper = PAPER_ABLATIONS[method]
         resets = np.mean([sum(sum(scores.results[f][s]["resets"]) for f in folds) for s in seeds])
         cells = [_cell(_interval(scores, key, folds, seeds)) for key in ("E_pose", "E_vel", "A_accl")]
-        label = "(a) full" if method == "ours" else LABELS[method]
+        label = "(a) full" if method == "no_planner" else LABELS[method]
         lines.append(_row([label, f"{resets:g}", *cells, *(f"{v:g}" for v in paper)]))
     takes = sum(len(names) for names in next(iter(rows.values())).takes(folds))
-    told = f"Left out: {', '.join(fold.removeprefix('without') for fold in folds)}; {takes} takes, {len(seeds)} seed"
+    without = ", ".join(fold.removeprefix("without") for fold in folds)
+    told = f"The policy alone, no planner, in every row. Left out: {without}; {takes} takes, {len(seeds)} seed"
     return [*lines, "", f"{told}{'s' if len(seeds) > 1 else ''} of every row. Resets: a whole pass over them."]
 
 
