@@ -76,6 +76,7 @@ class PlannerSettings:
         joints: only hinges whose name contains one of these are added to.
         acceleration: reward lost per unit (m/s^2, rad/s^2) of the velocities' mean absolute change.
         head: reward lost per metre by which the head is lower than what is followed has it.
+        lost: m; a body whose head is lower than that by more is worth nothing to the fail-safe, whatever its plan.
         margin: reward by which a way must do better than the plan so far to be taken, and either than no addition.
         discount: of a frame.
         kappa: of the fail-safe, where it has none of its own, for the values of plans.
@@ -91,6 +92,7 @@ class PlannerSettings:
     joints: tuple[str, ...]
     acceleration: float
     head: float
+    lost: float
     margin: float
     discount: float
     kappa: float
@@ -105,7 +107,7 @@ class PlannerSettings:
         check(self.samples >= 3, "samples", "must be at least 3: without an addition, the plan so far, and a new one")
         check(0 < self.every <= self.horizon, "every", "must lie between 1 and the horizon")
         check(self.knot > 0, "knot", "must be positive")
-        check(self.deviation > 0, "deviation", "must be positive")
+        check(min(self.deviation, self.lost) > 0, "deviation", "must be positive, as must lost")
         least = min(self.acceleration, self.head, self.margin)
         check(least >= 0, "acceleration", "must not be negative, nor head, nor margin")
         check(0 < self.discount <= 1, "discount", "must lie in (0, 1]")
@@ -127,7 +129,8 @@ class Planner:
         row: which of them.
 
     Attributes:
-        value: ``[N]`` what the best way was worth: discounted rewards and, at the horizon, V.
+        value: ``[N]`` what the best way was worth: discounted rewards and, at the horizon, V; nothing for a body that
+            lies where what is followed stands.
 
     Raises:
         InputError: actions are torques, the policy has a memory, or no hinge is named.
@@ -168,7 +171,7 @@ class Planner:
         worlds = base.batch_size[0] // settings.samples
         self._plan = torch.zeros(worlds, settings.horizon + settings.every, len(hinges))
         self._age = 0
-        self.value = torch.zeros(worlds)
+        self._worth, self.value = torch.zeros(worlds), torch.zeros(worlds)
 
     def _what_is_followed(self, states: Tensor) -> tuple[dict[str, Tensor], Tensor]:
         """What the reward reads of the regressor's bodies, and their heads' height ``[F]`` m.
@@ -193,6 +196,9 @@ class Planner:
         if self._age % self.settings.every == 0:
             self._look_ahead(base)
         self._age += 1
+        head = torch.as_tensor(base.body_state()["xpos"])[:, base.problem.humanoid.head, 2]
+        low = self._head_height[self._row(base.observe())] - head > self.settings.lost
+        self.value = torch.where(low, 0.0, self._worth)
         now = self._plan[:, 0].clone()
         self._plan = self._plan.roll(-1, 1)
         self._plan[:, -1] = 0.0
@@ -249,7 +255,7 @@ class Planner:
         # Chance finds small gains in any noise; to follow each of them is to tremble.
         enough = score.amax(0) - settings.margin
         best = torch.where(score[0] >= enough, 0, torch.where(score[1] >= enough, 1, best))
-        self.value = worth[best, worlds]
+        self._worth = worth[best, worlds]
         self._plan[:, : settings.horizon] = ways[best, worlds]
 
     def _copy(self, state: Mapping[str, Tensor]) -> None:
