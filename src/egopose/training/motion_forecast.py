@@ -28,6 +28,7 @@ class KernelSettings:
         axes, whitening, ridge, length: see :func:`egopose.models.kernel_regression.fit_kernel_regression`.
         centres: moments of training remembered at most, evenly chosen; half of them are mirror images.
         share: of its curve; the rest is the networks'.
+        added: share of what the likest moments add to the shares of last and mean pose.
         least: frames of the future that a moment must have to be remembered; a take's last pose stands for the rest.
         kept_ridge: of the shares of last and mean pose, in their variance.
     """
@@ -39,6 +40,7 @@ class KernelSettings:
     length: float
     centres: int
     share: float
+    added: float
     least: int
     kept_ridge: float
 
@@ -52,6 +54,7 @@ class KernelSettings:
         check(min(self.ridge, self.length, self.kept_ridge) > 0, "ridge", "must be positive, as must the others")
         check(self.centres >= 4, "centres", "must be at least 4")
         check(0 < self.share < 1, "share", "must lie between 0 and 1")
+        check(0 < self.added <= 1, "added", "must lie in (0, 1]")
 
 
 @dataclass(frozen=True)
@@ -198,7 +201,7 @@ def fit_kernel_forecaster(
     rest = wanted - torch.einsum("npa,akp->nkp", given, model.kept)
     model.kernel = fit_kernel_regression(
         model.parts(seen),
-        rest.flatten(1),
+        kernel.added * rest.flatten(1),
         axes=kernel.axes,
         whitening=kernel.whitening,
         ridge=kernel.ridge,
