@@ -49,7 +49,7 @@ from egopose.training.predictions import predict_takes, torch_threads
 
 HERE: dict[str, Any] = {
     "bins": [2, 3], "axes": 1000, "whitening": 0.5, "ridge": 0.1, "length": 1.0, "centres": 1000, "share": 0.3,
-    "least": 12, "kept_ridge": 1e-3,
+    "added": 1.0, "least": 12, "kept_ridge": 1e-3,
 }  # fmt: skip
 CONTEXT, HORIZON = SMALL["context"], SMALL["horizon"]
 
@@ -132,11 +132,12 @@ def test_its_shares_and_its_kernel_are_ridge_regressions_of_the_splines_coeffici
     chosen: dict[str, Any] = {"axes": 9, "whitening": 0.5, "ridge": 0.2, "length": 1.5}
     noisy = poses + 0.1 * torch.randn(40, 13)
     contexts = contexts_of(noisy, CONTEXT)
-    made = with_kernel(**chosen, least=least, kept_ridge=kept_ridge)
+    made = with_kernel(**chosen, least=least, kept_ridge=kept_ridge, added=0.4)
     model = fit_kernel_forecaster(contexts, poses, spans, mirror, made, FPS)
 
     moments = [(now, s.stop) for s in (spans[0], spans[2]) for now in range(s.start + CONTEXT - 1, s.stop - least)]
     learned = torch.cat([poses[3:20], poses[26:40]]).double().numpy()
+    learned = np.concatenate([learned, learned[:, ::-1] * mirror.sign.numpy()])
     mean, std = learned.mean(0), learned.std(0)
     np.testing.assert_allclose(model.mean, mean, atol=1e-5)
     np.testing.assert_allclose(model.std, std, rtol=1e-5)
@@ -157,9 +158,8 @@ def test_its_shares_and_its_kernel_are_ridge_regressions_of_the_splines_coeffici
         np.testing.assert_allclose(model.kept[:, :, p], shares, atol=1e-3)
         rest[:, :, p] -= pair @ shares
     parts = np.concatenate([seen[:, 3:].mean(1), seen[:, :3].mean(1)], axis=-1)
-    by_hand = fit_kernel_regression(
-        torch.from_numpy(parts).float(), torch.from_numpy(rest).flatten(1).float(), **chosen
-    )
+    inputs, outputs = (torch.from_numpy(rows).flatten(1).float() for rows in (parts, 0.4 * rest))
+    by_hand = fit_kernel_regression(inputs, outputs, **chosen)
     fresh = torch.randn(5, 26)
     torch.testing.assert_close(model.kernel(fresh), by_hand(fresh), atol=2e-3, rtol=0)
     assert not model.training
@@ -249,6 +249,8 @@ def test_too_short_a_stretch_is_named(longest: int, learns: bool) -> None:
         ("centres", 3, "centres"),
         ("share", 1.0, "share"),
         ("share", 0.0, "share"),
+        ("added", 0.0, "added"),
+        ("added", 1.1, "added"),
         ("shares", 0.5, "shares"),
     ],
 )

@@ -177,6 +177,25 @@ def test_the_value_is_what_a_plain_simulation_of_the_chosen_way_is_worth() -> No
     assert (score > policy_alone[1] + 1e-2).any()  # or there was nothing to choose between
 
 
+def test_a_body_that_lies_where_it_should_stand_is_worth_nothing() -> None:
+    states, env = true_motion()[0], make_env(3)
+    base = leaning(env)
+    followed = humanoid_state(states).float()
+    plain, lost = (planner_for(3, followed, lost=limit) for limit in (9.0, 0.3))
+    body = base.body_state()
+    qpos = body["qpos"].clone()
+    qpos[1, 2] -= 0.35
+    base.place(torch.arange(3), qpos, body["qvel"])
+    for planner in (plain, lost):
+        planner.addition(base)
+    assert (plain.value != 0).all()
+    torch.testing.assert_close(lost.value[[0, 2]], plain.value[[0, 2]])
+    assert lost.value[1] == 0
+    base.place(torch.arange(3), body["qpos"], body["qvel"])
+    lost.addition(base)
+    assert lost.value[1] != 0, "a body that has got up again is worth its plan"
+
+
 def test_without_a_better_way_the_policy_goes_on_alone() -> None:
     """Ways that shake are never worth it where acceleration costs a lot."""
     followed = other_motion()

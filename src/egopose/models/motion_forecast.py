@@ -63,8 +63,8 @@ class MotionForecaster(nn.Module):
     ) -> None:
         super().__init__()
         size = len(mean)
-        self.register_buffer("mean", mean.to(torch.float32))
-        self.register_buffer("std", std.to(torch.float32))
+        self.register_buffer("mean", mean.to(torch.float32, copy=True))
+        self.register_buffer("std", std.to(torch.float32, copy=True))
         self.gru = nn.GRU(size, recurrent, batch_first=True)
         out = nn.Linear(hidden, coefficients * size)
         nn.init.zeros_(out.weight)
@@ -104,8 +104,8 @@ class KernelForecaster(nn.Module):
         self, mean: Tensor, std: Tensor, bins: Sequence[int], coefficients: int, kernel: KernelRegression
     ) -> None:
         super().__init__()
-        self.register_buffer("mean", mean.to(torch.float32))
-        self.register_buffer("std", std.to(torch.float32))
+        self.register_buffer("mean", mean.to(torch.float32, copy=True))
+        self.register_buffer("std", std.to(torch.float32, copy=True))
         #: ``[2, K, P]``: shares of the last and of the mean pose.
         self.register_buffer("kept", torch.zeros(2, coefficients, len(mean)))
         self.bins, self.kernel = tuple(bins), kernel

@@ -185,7 +185,8 @@ def fit_kernel_forecaster(
     stop = torch.cat([torch.full((s.stop - s.start - settings.context - kernel.least + 1,), s.stop) for s in spans])
     chosen = torch.linspace(0, len(now) - 1, min(kernel.centres // 2, len(now))).round().long()
     now, stop = now[chosen], stop[chosen]
-    mean, std = state_statistics(torch.cat([poses[s.start : s.stop] for s in spans]), settings.std_floor)
+    true = torch.cat([poses[s.start : s.stop] for s in spans])
+    mean, std = state_statistics(torch.cat([true, mirror.state(true)]), settings.std_floor)
     model = blank_kernel_forecaster(settings, mean, std, fps)
     basis = spline_basis(settings.horizon + 1, settings.spacing, fps)[0]
     frames = torch.minimum(now[:, None] + torch.arange(len(basis)), stop[:, None] - 1)
