@@ -34,17 +34,13 @@ from egopose.motion_forecasts import FOLDER, PARTS, ForecastCurves, Members, wit
 from egopose.regression import load_regressor, regressor_name, regressor_tables, training_contexts
 from egopose.ship import _copy_components
 from egopose.training import blending
-from egopose.training.blending import KernelSettings, past_contexts
+from egopose.training import past_contexts as past
+from egopose.training.blending import KernelSettings
 from egopose.training.checkpoint import ComponentState, RunCheckpoint, has_component, metadata_of
 from egopose.training.fragments import Span, cross_fit_blocks
-from egopose.training.motion_forecast import (
-    Contexts,
-    ForecastLearner,
-    blank_kernel_forecaster,
-    build_forecaster,
-    cross_fit_starts,
-    fit_kernel_forecaster,
-)
+from egopose.training.kernel_forecast import Contexts, blank_kernel_forecaster, fit_kernel_forecaster
+from egopose.training.motion_forecast import ForecastLearner, build_forecaster, cross_fit_starts
+from egopose.training.past_contexts import past_contexts
 from egopose.training.predictions import predict_takes, torch_threads
 
 HERE: dict[str, Any] = {
@@ -470,7 +466,7 @@ def test_contexts_of_a_blended_regressor_are_what_it_says_of_them_as_clips(
     seen: SimpleNamespace, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     apart = known(seen)
-    monkeypatch.setattr(blending, "without_block", lambda fragments, *_: list(fragments))
+    monkeypatch.setattr(past, "without_block", lambda fragments, *_: list(fragments))
     rows, order = known(seen), torch.randperm(len(seen.starts))
     wanted = context_states(seen.model, seen.flow, [int(at) - CONTEXT + 1 for at in seen.starts], CONTEXT)
     unit = seen.model.state_std

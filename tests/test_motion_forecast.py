@@ -33,13 +33,8 @@ from egopose.ship import _copy_components
 from egopose.training.baselines import FitSettings, fit
 from egopose.training.checkpoint import ComponentState, RunCheckpoint, metadata_of
 from egopose.training.fragments import Span, cross_fit_blocks, group_blocks
-from egopose.training.motion_forecast import (
-    Contexts,
-    ForecasterSettings,
-    ForecastLearner,
-    build_forecaster,
-    cross_fit_starts,
-)
+from egopose.training.kernel_forecast import Contexts
+from egopose.training.motion_forecast import ForecasterSettings, ForecastLearner, build_forecaster, cross_fit_starts
 
 FPS = 30.0
 SMALL: dict[str, Any] = {

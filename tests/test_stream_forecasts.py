@@ -45,7 +45,8 @@ from egopose.stream import (
     stream,
 )
 from egopose.training.checkpoint import ComponentState, RunCheckpoint, metadata_of
-from egopose.training.motion_forecast import ForecasterSettings, blank_kernel_forecaster, build_forecaster
+from egopose.training.kernel_forecast import blank_kernel_forecaster
+from egopose.training.motion_forecast import ForecasterSettings, build_forecaster
 from egopose.training.predictions import torch_threads
 
 CONTEXT = 30

@@ -33,15 +33,8 @@ from egopose.regression import training_contexts
 from egopose.training.baselines import FitSettings, fit
 from egopose.training.checkpoint import ComponentState, RunCheckpoint, has_component, metadata_of
 from egopose.training.fragments import Span, cross_fit_blocks, group_blocks
-from egopose.training.motion_forecast import (
-    Contexts,
-    ForecasterSettings,
-    ForecastLearner,
-    blank_kernel_forecaster,
-    build_forecaster,
-    cross_fit_starts,
-    fit_kernel_forecaster,
-)
+from egopose.training.kernel_forecast import Contexts, blank_kernel_forecaster, fit_kernel_forecaster
+from egopose.training.motion_forecast import ForecasterSettings, ForecastLearner, build_forecaster, cross_fit_starts
 
 if TYPE_CHECKING:
     from egopose.pipeline import Agent

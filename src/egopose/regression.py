@@ -34,9 +34,10 @@ from egopose.models.kernel_regression import KernelRegression
 from egopose.models.mirror import state_mirror
 from egopose.models.regressor import StateRegressor
 from egopose.sight import finder_fingerprint, finder_of, seen_in_store
-from egopose.training.blending import KernelSettings, blend, past_contexts
+from egopose.training.blending import KernelSettings, blend
 from egopose.training.checkpoint import CHECKSUMS, ComponentState, RunCheckpoint, metadata_of, read_json, verify
 from egopose.training.fragments import Span, cross_fit_blocks, group_blocks, without_block
+from egopose.training.past_contexts import past_contexts
 from egopose.training.predictions import Flow, predict_takes
 from egopose.training.regressor_settings import RegressorSettings
 from egopose.training.supervised import Progress, State, TrainingResult, build_regressor, train_regressor
@@ -301,8 +302,8 @@ def training_contexts(
 ) -> Tensor:
     """States z ``[N, context, S]`` that a store's regressor, blind to those frames, sees up to each of them.
 
-    Those of a blended regressor are :func:`egopose.training.blending.past_contexts`; of a network alone, which looks
-    less far ahead, they are its cross-fitted states of the whole takes.
+    Those of a blended regressor are :func:`egopose.training.past_contexts.past_contexts`; of a network alone they are
+    its cross-fitted states of the whole takes.
 
     Args:
         config: resolved; whose regressor is trained already.

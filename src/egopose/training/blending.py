@@ -26,8 +26,6 @@ from egopose.training.regressor_settings import RegressorSettings
 from egopose.vision.encoders import FLOW_CHANNELS
 from egopose.vision.limbs import load_finder
 
-_CONTEXTS = 64  # contexts that are regressed together
-
 
 @dataclass(frozen=True)
 class KernelSettings:
@@ -135,10 +133,10 @@ def blend(
     """
     with torch_threads(settings.threads):
         seen = window_table(flow, takes, kernel_settings, settings.encode_batch)
-        image = _image(flow, takes, states, network, humanoid, kernel_settings, settings.encode_batch)
+        image = mirror_image(flow, takes, states, network, humanoid, kernel_settings, settings.encode_batch)
         wanted, by_network = network.normalise(states), network.normalise(crossed_states)
         by_kernel = torch.zeros_like(wanted)
-        importance = _importance(humanoid, network.state_std)
+        importance = importance_of(humanoid, network.state_std)
         for block in blocks:
             others = without_block(fragments, block, settings.margin, settings.margin)
             left_out = MeanOfKernels(fit_kernels(seen, wanted, others, kernel_settings, importance, image))
@@ -160,59 +158,7 @@ def blend(
     return Blend(model, kernels, crossed * model.state_std + model.state_mean, chosen)
 
 
-@torch.no_grad()
-def past_contexts(
-    model: StateRegressor,
-    crossed_states: Tensor,
-    flow: Flow,
-    states: Tensor,
-    takes: Sequence[Span],
-    fragments: Sequence[Span],
-    blocks: Sequence[Sequence[Span]],
-    humanoid: HumanoidModel,
-    settings: RegressorSettings,
-    kernel_settings: KernelSettings,
-    starts: Tensor,
-    context: int,
-) -> Tensor:
-    """What is known at a training frame of it and the frames before, by kernels that have not seen them.
-
-    A blended F looks ahead: a forecast learned from what it says of whole takes would know of what it forecasts. Of
-    the network, whose cross-fitted forms are not kept, the states of whole takes stand in.
-
-    Args:
-        model: the blended F.
-        crossed_states, flow, states, takes, fragments, blocks, humanoid, settings, kernel_settings: as for
-            :func:`blend`.
-        starts: ``[N]`` global frames of the blocks, the last ones of contexts that lie in their take.
-        context: frames.
-
-    Returns:
-        ``[N, context, S]`` states z, each row as if its last frame were the clip's.
-    """
-    with torch_threads(settings.threads):
-        seen = window_table(flow, takes, kernel_settings, settings.encode_batch)
-        wanted, by_network = model.normalise(states), model.normalise(crossed_states)
-        image = _image(flow, takes, states, model, humanoid, kernel_settings, settings.encode_batch)
-        importance, windows = _importance(humanoid, model.state_std), kernel_settings.windows()
-        views = view_table(flow, takes, kernel_settings, settings.encode_batch)
-        out = torch.zeros(len(starts), context, len(model.state_std))
-        margin = max(settings.margin, context)
-        for block in blocks:
-            mine = torch.cat([((starts >= s.start) & (starts < s.stop)).nonzero()[:, 0] for s in block])
-            others = without_block(fragments, block, margin, margin)
-            kernels = fit_kernels(seen, wanted, others, kernel_settings, importance, image)
-            for kernel in kernels:
-                kernel.exact = False
-            left_out = MeanOfKernels(kernels)
-            for part in mine.split(_CONTEXTS):
-                frames = starts[part, None] + torch.arange(1 - context, 1)
-                by_kernel = left_out(windows(windows.pad(views[frames])))
-                out[part] = model.head.network_share * by_network[frames] + model.head.kernel_share * by_kernel
-    return out * model.state_std + model.state_mean
-
-
-def _image(
+def mirror_image(
     flow: Flow,
     takes: Sequence[Span],
     states: Tensor,
@@ -314,7 +260,7 @@ def fit_kernels(
     return kernels
 
 
-def _importance(humanoid: HumanoidModel, state_std: Tensor) -> Tensor:
+def importance_of(humanoid: HumanoidModel, state_std: Tensor) -> Tensor:
     """``[S]``: the joint angles in rad without the hands, as E_pose has them; nothing else of the state."""
     out = torch.zeros_like(state_std)
     angles = slice(5, 5 + len(humanoid.joint_range))

@@ -12,49 +12,11 @@ from torch import Tensor
 
 from egopose.config import from_mapping
 from egopose.errors import InputError
-from egopose.models.kernel_regression import KernelRegression, fit_kernel_regression
 from egopose.models.mirror import StateMirror
-from egopose.models.motion_forecast import KernelForecaster, MotionForecaster, spline_basis
+from egopose.models.motion_forecast import MotionForecaster, spline_basis
 from egopose.models.regressor import state_statistics
 from egopose.training.fragments import Span, split_validation, without_block
-
-
-@dataclass(frozen=True)
-class KernelSettings:
-    """The group ``kernel`` of ``conf/forecaster``.
-
-    Args:
-        bins: see :class:`KernelForecaster`; they add up to the context.
-        axes, whitening, ridge, length: see :func:`egopose.models.kernel_regression.fit_kernel_regression`.
-        centres: moments of training remembered at most, evenly chosen; half of them are mirror images.
-        share: of its curve; the rest is the networks'.
-        added: share of what the likest moments add to the shares of last and mean pose.
-        least: frames of the future that a moment must have to be remembered; a take's last pose stands for the rest.
-        kept_ridge: of the shares of last and mean pose, in their variance.
-    """
-
-    bins: tuple[int, ...]
-    axes: int
-    whitening: float
-    ridge: float
-    length: float
-    centres: int
-    share: float
-    added: float
-    least: int
-    kept_ridge: float
-
-    def __post_init__(self) -> None:
-        def check(ok: bool, name: str, cause: str) -> None:
-            if not ok:
-                raise InputError("conf/forecaster kernel", name, cause)
-
-        check(bool(self.bins) and min(self.bins) > 0, "bins", "must be positive")
-        check(self.axes > 0 and self.least > 0, "axes", "must be positive, as must least")
-        check(min(self.ridge, self.length, self.kept_ridge) > 0, "ridge", "must be positive, as must the others")
-        check(self.centres >= 4, "centres", "must be at least 4")
-        check(0 < self.share < 1, "share", "must lie between 0 and 1")
-        check(0 < self.added <= 1, "added", "must lie in (0, 1]")
+from egopose.training.kernel_forecast import Contexts, KernelSettings
 
 
 @dataclass(frozen=True)
@@ -117,98 +79,6 @@ def build_forecaster(
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         return MotionForecaster(mean, std, settings.recurrent, settings.hidden, settings.dropout, count)
-
-
-def blank_kernel_forecaster(
-    settings: ForecasterSettings, mean: Tensor, std: Tensor, fps: float, centres: int = 0
-) -> KernelForecaster:
-    """One that knows nothing yet, for pose states of these statistics ``[P]`` and as many moments to remember."""
-    assert settings.kernel is not None
-    count, size = spline_basis(settings.horizon + 1, settings.spacing, fps)[0].shape[1], len(mean)
-    inputs = len(settings.kernel.bins) * size
-    kernel = KernelRegression(inputs, min(settings.kernel.axes, inputs), centres, count * size)
-    return KernelForecaster(mean, std, settings.kernel.bins, count, kernel)
-
-
-@dataclass(frozen=True)
-class Contexts:
-    """What has been seen up to some frames, pose states.
-
-    Args:
-        rows: ``[R, context, P]``.
-        row: ``[F]`` which of them ends at a frame, -1 for none.
-    """
-
-    rows: Tensor
-    row: Tensor
-
-    @classmethod
-    def at(cls, rows: Tensor, starts: Tensor, frames: int) -> Contexts:
-        """Rows of the frames ``starts [R]`` of ``frames``."""
-        row = torch.full((frames,), -1, dtype=torch.int64)
-        row[starts] = torch.arange(len(starts))
-        return cls(rows, row)
-
-    def __getitem__(self, now: Tensor) -> Tensor:
-        """``[B, context, P]`` up to the frames ``now [B]``, each of which has one."""
-        return self.rows[self.row[now]]
-
-
-def fit_kernel_forecaster(
-    contexts: Contexts,
-    poses: Tensor,
-    fragments: Sequence[Span],
-    mirror: StateMirror,
-    settings: ForecasterSettings,
-    fps: float,
-) -> KernelForecaster:
-    """The kernel forecaster of the contexts in ``fragments`` and their mirror images.
-
-    Args:
-        contexts: see :class:`ForecastLearner`.
-        poses: ``[F, P]`` true ones.
-        fragments: training stretches, in global frames.
-        mirror: of pose states.
-        settings: with a kernel's.
-        fps: frames per second.
-
-    Raises:
-        InputError: no fragment holds a context and the least of a future.
-    """
-    kernel = settings.kernel
-    assert kernel is not None
-    spans = [s for s in fragments if s.stop - s.start >= settings.context + kernel.least]
-    if not spans:
-        cause = f"none is longer than {settings.context} + {kernel.least} frames"
-        raise InputError("forecaster", "fragments", cause)
-    now = torch.cat([torch.arange(s.start + settings.context - 1, s.stop - kernel.least) for s in spans])
-    stop = torch.cat([torch.full((s.stop - s.start - settings.context - kernel.least + 1,), s.stop) for s in spans])
-    chosen = torch.linspace(0, len(now) - 1, min(kernel.centres // 2, len(now))).round().long()
-    now, stop = now[chosen], stop[chosen]
-    true = torch.cat([poses[s.start : s.stop] for s in spans])
-    mean, std = state_statistics(torch.cat([true, mirror.state(true)]), settings.std_floor)
-    model = blank_kernel_forecaster(settings, mean, std, fps)
-    basis = spline_basis(settings.horizon + 1, settings.spacing, fps)[0]
-    frames = torch.minimum(now[:, None] + torch.arange(len(basis)), stop[:, None] - 1)
-    seen = contexts[now]
-    seen, future = ((torch.cat([rows, mirror.state(rows)]) - model.mean) / model.std for rows in (seen, poses[frames]))
-    wanted = torch.linalg.pinv(basis) @ future
-    # Shares of the last and the mean pose, for each coefficient and number of its own.
-    given = torch.stack([seen[:, -1], seen.mean(1)], dim=-1)
-    square = torch.einsum("npa,npb->pab", given, given) / len(given)
-    square += kernel.kept_ridge * torch.diag_embed(square.diagonal(dim1=-2, dim2=-1)) + 1e-6 * torch.eye(2)
-    product = torch.einsum("npa,nkp->pak", given, wanted) / len(given)
-    model.kept.copy_(torch.linalg.solve(square, product).permute(1, 2, 0))
-    rest = wanted - torch.einsum("npa,akp->nkp", given, model.kept)
-    model.kernel = fit_kernel_regression(
-        model.parts(seen),
-        kernel.added * rest.flatten(1),
-        axes=kernel.axes,
-        whitening=kernel.whitening,
-        ridge=kernel.ridge,
-        length=kernel.length,
-    )
-    return model.eval()
 
 
 def cross_fit_starts(
