@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from typing import Any
 
 import pytest
 import torch
 
 from egopose.errors import InputError
 from egopose.models.baselines.recurrent import RecurrentForecaster, ground_truth_mask, pose_state_size
+from egopose.models.mirror import StateMirror
 from egopose.training.baselines import Fit, FitSettings, fit
 from egopose.training.fragments import Span
 from egopose.training.recurrent_baselines import RecurrentLearner, RecurrentSettings
@@ -61,6 +63,30 @@ def test_both_schemes_learn_to_go_on_with_a_sine(settings: RecurrentSettings) ->
     assert result.held_out == pytest.approx(work.held_out())
     forecast = work.model.forecast(waves()[None, 100:110], 12)
     assert (forecast[0] - waves()[110:122]).abs().mean() < 0.25
+
+
+@pytest.mark.parametrize("settings", [ERD, ACLSTM])
+def test_half_of_the_windows_are_mirror_images_where_there_is_a_mirror(settings: RecurrentSettings) -> None:
+    """Of truths and inputs alike, those held out never: one that negates all shows which windows it was."""
+    mirror = StateMirror(torch.arange(3), -torch.ones(3))
+    poses, spans = waves() + 5.0, [Span(0, 200), Span(200, 400)]
+    work = RecurrentLearner(poses, spans, settings, 256, 0.2, 1, mirror)
+    given: list[torch.Tensor] = []
+    for name in ("forward", "conditioned"):
+        whole = getattr(work.model, name)
+
+        def spy(rows: torch.Tensor, *rest: Any, whole: Any = whole) -> Any:
+            given.append(work.model.denormalise(rows))
+            return whole(rows, *rest)
+
+        setattr(work.model, name, spy)
+    work.loss(torch.Generator().manual_seed(0), 0.0)
+    shown = given[0][:, :, 0].sign()
+    assert (shown == shown[:, :1]).all(), "a window is mirrored whole"
+    assert 0.35 < float((shown[:, 0] < 0).float().mean()) < 0.65
+    given.clear()
+    work.held_out()
+    assert (given[0][:, :, 0] > 0).all()
 
 
 def test_a_training_that_was_cut_off_ends_as_one_left_alone() -> None:

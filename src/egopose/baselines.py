@@ -26,6 +26,7 @@ from egopose.files import write_text_whole
 from egopose.material import Material, load_material, run_material
 from egopose.models.baselines.path_pose import PathPose
 from egopose.models.baselines.recurrent import RecurrentForecaster, pose_state_size
+from egopose.models.mirror import state_mirror
 from egopose.models.pose_regression import integrate_root, pose_regression, split_state, state_to_qpos
 from egopose.motion import rotations as rot
 from egopose.motion.motion import Motion
@@ -154,7 +155,8 @@ def _learner(
     if _kind(config) == "recurrent":
         poses = states[:, : pose_state_size(states.shape[1])]
         recurrent = RecurrentSettings.from_config(own)
-        return RecurrentLearner(poses, spans, recurrent, settings.batch, settings.validation_share, seed)
+        mirror = state_mirror(material.humanoid.skeleton).poses() if recurrent.mirror else None
+        return RecurrentLearner(poses, spans, recurrent, settings.batch, settings.validation_share, seed, mirror)
     path = PathPoseSettings.from_config(own)
     flow = store.flow(flow_name(config))
     return PathPoseLearner(flow, states, spans, path, settings.batch, settings.validation_share, seed)

@@ -13,6 +13,7 @@ from torch import Tensor
 from egopose.config import from_mapping
 from egopose.errors import InputError
 from egopose.models.baselines.recurrent import RecurrentForecaster, ground_truth_mask
+from egopose.models.mirror import StateMirror
 from egopose.models.regressor import state_statistics
 from egopose.training.fragments import Span, split_validation
 
@@ -31,6 +32,7 @@ class RecurrentSettings:
         truth, own: with ``alternate``, see :func:`ground_truth_mask`.
         context, horizon: frames given and frames forecast; a training window has both.
         std_floor: of the deviations poses are divided by.
+        mirror: half of the training windows are mirror images.
     """
 
     encoder: tuple[int, ...]
@@ -46,6 +48,7 @@ class RecurrentSettings:
     context: int
     horizon: int
     std_floor: float
+    mirror: bool = False
 
     @classmethod
     def from_config(cls, values: Mapping[str, Any], source: str = "conf/baseline") -> RecurrentSettings:
@@ -79,6 +82,7 @@ class RecurrentLearner:
         batch: windows a step.
         validation_share: of each fragment, held out.
         seed: of the network's start.
+        mirror: of pose states; None where no window is to be mirrored.
 
     Raises:
         InputError: no fragment has two frames.
@@ -92,6 +96,7 @@ class RecurrentLearner:
         batch: int,
         validation_share: float,
         seed: int,
+        mirror: StateMirror | None = None,
     ) -> None:
         self.settings, self.batch = settings, batch
         train, kept = split_validation(fragments, validation_share, settings.context)
@@ -101,6 +106,7 @@ class RecurrentLearner:
         rows = torch.cat([poses[a:b] for a, b in self.train.tolist()])
         self.model = build_forecaster(settings, *state_statistics(rows, settings.std_floor), seed)
         self.poses = self.model.normalise(poses)
+        self.images = None if mirror is None else self.model.normalise(mirror.state(poses))
         self.windows = self._held_out_windows([span for span, _ in kept])
 
     def loss(self, generator: torch.Generator, progress: float) -> tuple[Tensor, int]:
@@ -112,7 +118,11 @@ class RecurrentLearner:
         starts = starts + (torch.rand(self.batch, generator=generator) * room).long()
         frames = starts[:, None] + torch.arange(length)
         inside = frames < stops[:, None]
-        poses = self.poses[torch.minimum(frames, stops[:, None] - 1)]
+        frames = torch.minimum(frames, stops[:, None] - 1)
+        poses = self.poses[frames]
+        if self.images is not None:
+            flip = torch.rand(self.batch, generator=generator) < 0.5
+            poses = torch.where(flip[:, None, None], self.images[frames], poses)
         given, wanted = poses[:, :-1], poses[:, 1:]
         if self.settings.scheme == "alternate":
             truth = ground_truth_mask(length - 1, self.settings.truth, self.settings.own)
