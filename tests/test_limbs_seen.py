@@ -247,9 +247,9 @@ def test_limbs_are_in_the_windows_means_of_them() -> None:
 
 
 @torch.no_grad()
-def test_frame_by_frame_limbs_are_what_the_video_up_to_there_shows() -> None:
-    model, frames = regressor(), 17
-    features = model.encode(frames_seen(frames))
+def assert_frame_by_frame_as_the_video_up_to_there(model: StateRegressor, features: torch.Tensor) -> None:
+    """Visual features ``[T, D]`` pushed one by one, and causally at once, say what a video does that ends later."""
+    frames = len(features)
     causal = CausalRegression(model, torch.tensor([[-9.0, 9.0]]).repeat(52, 1), LOOKAHEAD)
     rows = [row for t in range(frames) if (row := causal.push(t, features[t])) is not None] + list(causal.drain())
     at_once = model.from_features(features[None], lookahead=LOOKAHEAD)["humanoid_state"][0]
@@ -259,6 +259,12 @@ def test_frame_by_frame_limbs_are_what_the_video_up_to_there_shows() -> None:
         end = min(t + LOOKAHEAD, frames - 1)
         torch.testing.assert_close(row.humanoid_state, known[end][t], atol=1e-5, rtol=1e-4)
         torch.testing.assert_close(at_once[t], known[end][t], atol=1e-5, rtol=1e-4)
+
+
+@torch.no_grad()
+def test_frame_by_frame_limbs_are_what_the_video_up_to_there_shows() -> None:
+    model = regressor()
+    assert_frame_by_frame_as_the_video_up_to_there(model, model.encode(frames_seen(17)))
 
 
 # --- settings and names ----------------------------------------------------------------------------------------------

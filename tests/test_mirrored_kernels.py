@@ -14,6 +14,7 @@ from env_stand_in import group
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from test_blended import KERNEL, blended
+from test_limbs_seen import assert_frame_by_frame_as_the_video_up_to_there
 from test_material import configuration, fill_flow
 from torch import Tensor
 
@@ -25,7 +26,6 @@ from egopose.envs.mdp.observations import humanoid_state
 from egopose.errors import InputError
 from egopose.estimate import seen_in
 from egopose.humanoid.model import HumanoidModel
-from egopose.inference.causal import CausalRegression
 from egopose.models.blended import MeanOfKernels, TimeWindows, blended_regressor
 from egopose.models.kernel_regression import KernelRegression, fit_kernel_regression
 from egopose.models.mirror import StateMirror, state_mirror
@@ -42,7 +42,6 @@ from egopose.vision.limbs import LimbFinder, as_plane, load_finder
 
 ALSO = ((6, 3, 1.0), (0, 1, 1.5))
 COUNTS = (3, 5, 1)
-LOOKAHEAD = 3
 SETTINGS = KernelSettings(**KERNEL, also=ALSO, mirror=True)
 
 
@@ -135,17 +134,8 @@ def test_another_number_of_kernels_than_of_sets_is_refused(counts: tuple[int, ..
 
 @torch.no_grad()
 def test_frame_by_frame_three_sets_show_what_the_video_up_to_there_does() -> None:
-    model, frames = regressor(), 24
-    features = model.encode(0.1 * torch.randn(frames, 2, 8, 8))
-    causal = CausalRegression(model, torch.tensor([[-9.0, 9.0]]).repeat(52, 1), LOOKAHEAD)
-    rows = [row for t in range(frames) if (row := causal.push(t, features[t])) is not None] + list(causal.drain())
-    at_once = model.from_features(features[None], lookahead=LOOKAHEAD)["humanoid_state"][0]
-    known = [model.from_features(features[None, : t + 1])["humanoid_state"][0] for t in range(frames)]
-    assert len(rows) == frames
-    for t, row in enumerate(rows):
-        end = min(t + LOOKAHEAD, frames - 1)
-        torch.testing.assert_close(row.humanoid_state, known[end][t], atol=1e-5, rtol=1e-4)
-        torch.testing.assert_close(at_once[t], known[end][t], atol=1e-5, rtol=1e-4)
+    model = regressor()
+    assert_frame_by_frame_as_the_video_up_to_there(model, model.encode(0.1 * torch.randn(24, 2, 8, 8)))
 
 
 # --- mirror images of limbs ------------------------------------------------------------------------------------------

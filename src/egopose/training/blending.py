@@ -132,8 +132,9 @@ def blend(
         kernel_settings: of the kernel and the shares.
     """
     with torch_threads(settings.threads):
-        seen = window_table(flow, takes, kernel_settings, settings.encode_batch)
-        image = mirror_image(flow, takes, states, network, humanoid, kernel_settings, settings.encode_batch)
+        views = view_table(flow, takes, kernel_settings, settings.encode_batch)
+        seen = windowed(views, takes, kernel_settings)
+        image = mirror_image(views, takes, states, network, humanoid, kernel_settings)
         wanted, by_network = network.normalise(states), network.normalise(crossed_states)
         by_kernel = torch.zeros_like(wanted)
         importance = importance_of(humanoid, network.state_std)
@@ -159,18 +160,17 @@ def blend(
 
 
 def mirror_image(
-    flow: Flow,
+    views: Tensor,
     takes: Sequence[Span],
     states: Tensor,
     model: StateRegressor,
     humanoid: HumanoidModel,
     settings: KernelSettings,
-    batch: int,
 ) -> tuple[Tensor, Tensor] | None:
     """What the kernels see of the mirrored scene and its states in normalised units; None where it is not learned."""
     if not settings.mirror:
         return None
-    table = window_table(flow, takes, settings, batch, mirrored=True)
+    table = windowed(mirrored_view(views, settings), takes, settings)
     return table, model.normalise(state_mirror(humanoid.skeleton).state(states))
 
 
@@ -187,25 +187,28 @@ def window_table(
         batch: frames read at a time.
         mirrored: of the scene's mirror image.
     """
+    views = view_table(flow, takes, settings, batch)
+    return windowed(mirrored_view(views, settings) if mirrored else views, takes, settings)
+
+
+def windowed(views: Tensor, takes: Sequence[Span], settings: KernelSettings) -> Tensor:
+    """The time windows of frames seen each by itself (:func:`view_table`), take by take, ``[F, V]``."""
     windows = settings.windows()
-    views = view_table(flow, takes, settings, batch, mirrored)
-    rows = torch.zeros(len(flow), windows.count * views.shape[1])
+    rows = torch.zeros(len(views), windows.count * views.shape[1])
     for span in takes:
         rows[span.start : span.stop] = windows(windows.pad(views[None, span.start : span.stop]))[0]
     return rows
 
 
 @torch.no_grad()
-def view_table(
-    flow: Flow, takes: Sequence[Span], settings: KernelSettings, batch: int, mirrored: bool = False
-) -> Tensor:
+def view_table(flow: Flow, takes: Sequence[Span], settings: KernelSettings, batch: int) -> Tensor:
     """As :func:`window_table`, each frame by itself: ``[F, 2 cells^2 + limbs]``."""
     rows = torch.zeros(len(flow), FLOW_CHANNELS * settings.cells**2 + settings.limb_numbers)
     for span in takes:
         for at in range(span.start, span.stop, batch):
             part = np.arange(at, min(at + batch, span.stop))
             rows[part] = kernel_view(take_frames(flow, part), settings.cells, settings.limb_numbers)
-    return mirrored_view(rows, settings) if mirrored else rows
+    return rows
 
 
 def mirrored_view(view: Tensor, settings: KernelSettings) -> Tensor:

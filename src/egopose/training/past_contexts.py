@@ -10,7 +10,7 @@ from torch import Tensor
 from egopose.humanoid.model import HumanoidModel
 from egopose.models.blended import MeanOfKernels
 from egopose.models.regressor import StateRegressor
-from egopose.training.blending import KernelSettings, fit_kernels, importance_of, mirror_image, view_table, window_table
+from egopose.training.blending import KernelSettings, fit_kernels, importance_of, mirror_image, view_table, windowed
 from egopose.training.fragments import Span, without_block
 from egopose.training.predictions import Flow, torch_threads
 from egopose.training.regressor_settings import RegressorSettings
@@ -49,11 +49,11 @@ def past_contexts(
         ``[N, context, S]`` states z, each row as if its last frame were the clip's.
     """
     with torch_threads(settings.threads):
-        seen = window_table(flow, takes, kernel_settings, settings.encode_batch)
-        wanted, by_network = model.normalise(states), model.normalise(crossed_states)
-        image = mirror_image(flow, takes, states, model, humanoid, kernel_settings, settings.encode_batch)
-        importance, windows = importance_of(humanoid, model.state_std), kernel_settings.windows()
         views = view_table(flow, takes, kernel_settings, settings.encode_batch)
+        seen = windowed(views, takes, kernel_settings)
+        wanted, by_network = model.normalise(states), model.normalise(crossed_states)
+        image = mirror_image(views, takes, states, model, humanoid, kernel_settings)
+        importance, windows = importance_of(humanoid, model.state_std), kernel_settings.windows()
         out = torch.zeros(len(starts), context, len(model.state_std))
         margin = max(settings.margin, context)
         for block in blocks:
