@@ -39,6 +39,7 @@ from egopose.training.motion_forecast import ForecasterSettings, ForecastLearner
 FPS = 30.0
 SMALL: dict[str, Any] = {
     "recurrent": 8, "hidden": 16, "spacing": 3, "context": 5, "horizon": 12, "members": 2, "kernel": None,
+    "continued": None,
 }  # fmt: skip
 
 

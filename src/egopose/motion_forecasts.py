@@ -28,10 +28,15 @@ from egopose.humanoid.soles import out_of_floor
 from egopose.inference.forecaster import placed_states
 from egopose.material import Material
 from egopose.models.mirror import state_mirror
-from egopose.models.motion_forecast import KernelForecaster, MotionForecaster, spline_basis
+from egopose.models.motion_forecast import ContinuedForecaster, KernelForecaster, MotionForecaster, spline_basis
 from egopose.regression import training_contexts
 from egopose.training.baselines import FitSettings, fit
 from egopose.training.checkpoint import ComponentState, RunCheckpoint, has_component, metadata_of
+from egopose.training.continued_forecast import (
+    blank_continued_forecaster,
+    continued_share,
+    fit_continued_forecaster,
+)
 from egopose.training.fragments import Span, cross_fit_blocks, group_blocks
 from egopose.training.kernel_forecast import Contexts, blank_kernel_forecaster, fit_kernel_forecaster
 from egopose.training.motion_forecast import ForecasterSettings, ForecastLearner, build_forecaster, cross_fit_starts
@@ -41,16 +46,19 @@ if TYPE_CHECKING:
 
 FOLDER = "forecaster"
 #: Components of that folder that forecasts are made by; ``futures`` are those of the training frames.
-PARTS = ("members", "kernel", "sizes")
+PARTS = ("members", "kernel", "sizes", "continued")
 
 
 @dataclass(frozen=True)
 class Members:
-    """A forecaster's parts: ``(1 - share) * mean of the networks' curves + share * the kernel's``."""
+    """A forecaster's parts: ``(1 - share) * mean of the networks' curves + share * the kernel's``, and of each
+    coefficient of that a share ``[K, 1]`` of the one that goes on frame by frame."""
 
     networks: list[MotionForecaster]
-    kernel: KernelForecaster | None
-    share: float
+    kernel: KernelForecaster | None = None
+    share: float = 0.0
+    continued: ContinuedForecaster | None = None
+    continued_share: Tensor | None = None
 
 
 def with_futures(config: Mapping[str, Any], material: Material, run: Path) -> Material:
@@ -163,11 +171,15 @@ def _curves(members: Members, contexts: Tensor) -> Tensor:
 
 
 def _curve(members: Members, contexts: Tensor) -> Tensor:
-    def of(member: MotionForecaster | KernelForecaster) -> Tensor:
+    def of(member: MotionForecaster | KernelForecaster | ContinuedForecaster) -> Tensor:
         return member((contexts - member.mean) / member.std) * member.std + member.mean
 
     curve = torch.stack([of(network) for network in members.networks]).mean(0)
-    return curve if members.kernel is None else torch.lerp(curve, of(members.kernel), members.share)
+    if members.kernel is not None:
+        curve = torch.lerp(curve, of(members.kernel), members.share)
+    if members.continued is None or members.continued_share is None:
+        return curve
+    return torch.lerp(curve, of(members.continued), members.continued_share)
 
 
 def _train(config: Mapping[str, Any], material: Material, folder: Path) -> None:
@@ -203,10 +215,19 @@ def _train(config: Mapping[str, Any], material: Material, folder: Path) -> None:
                 flush=True,
             )
             out.append(learner.model)
-        if settings.kernel is None:
-            return Members(out, None, 0.0)
-        kernel = fit_kernel_forecaster(seen, truth, fragments, mirror, settings, fps)
-        return Members(out, kernel, settings.kernel.share)
+        made = Members(out)
+        if settings.kernel is not None:
+            kernel = fit_kernel_forecaster(seen, truth, fragments, mirror, settings, fps)
+            made = replace(made, kernel=kernel, share=settings.kernel.share)
+        if settings.continued is not None:
+            continued, result = fit_continued_forecaster(truth, fragments, mirror, settings, fps, seed)
+            print(
+                f"forecaster{label}, frame by frame: held out {result.held_out:.3f} after {result.frames} frames",
+                file=sys.stderr,
+                flush=True,
+            )
+            made = replace(made, continued=continued, continued_share=continued_share(settings))
+        return made
 
     blocks = cross_fit_blocks(spans, settings.cross_fit)
     if config["data"]["split"]["kind"] == "subject":
@@ -226,6 +247,8 @@ def _train(config: Mapping[str, Any], material: Material, folder: Path) -> None:
     if whole.kernel is not None:
         sizes = {"centres": torch.tensor(len(whole.kernel.kernel.centres))}
         made["kernel"], made["sizes"] = whole.kernel, ComponentState(lambda: sizes, lambda _: None)
+    if whole.continued is not None:
+        made["continued"] = whole.continued
     RunCheckpoint(made).save(part, metadata=metadata_of("motion forecaster", size, 0, 0, 0.0))
     os.replace(part, folder)
 
@@ -234,12 +257,20 @@ def _members(settings: ForecasterSettings, folder: Path, size: int, fps: float) 
     zero, one = torch.zeros(size), torch.ones(size)
     networks = [build_forecaster(settings, zero, one, fps, 0) for _ in range(settings.members)]
     parts: dict[str, Any] = {"members": nn.ModuleList(networks)}
-    kernel = None
+    kernel, continued = None, None
     if settings.kernel is not None:
         sizes: dict[str, Tensor] = {}
         RunCheckpoint({"sizes": ComponentState(dict, sizes.update)}).restore(folder, {"sizes"})
         kernel = parts["kernel"] = blank_kernel_forecaster(settings, zero, one, fps, int(sizes["centres"]))
+    if settings.continued is not None:
+        continued = parts["continued"] = blank_continued_forecaster(settings, zero, one, fps)
     RunCheckpoint(parts).restore(folder, set(parts))
     for part in parts.values():
         part.eval()
-    return Members(networks, kernel, 0.0 if settings.kernel is None else settings.kernel.share)
+    return Members(
+        networks,
+        kernel,
+        0.0 if settings.kernel is None else settings.kernel.share,
+        continued,
+        None if settings.continued is None else continued_share(settings),
+    )

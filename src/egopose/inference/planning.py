@@ -3,6 +3,8 @@
 The body that acts a video out is simulated anyway, so what an action leads to can be tried before it is taken
 (predictive sampling: Howell et al. 2022, arXiv 2212.00541; the policy's value at the horizon's end: Lowrey et al. 2019,
 POLO). A way to go on is the policy's mean action plus an addition that changes smoothly; the policy reacts in each.
+Chance alone rarely finds a way that is good in all joints, so later rounds try what lies between and about the best
+of those before (the cross-entropy method: Rubinstein 1999; in control: Chua et al. 2018, PETS).
 What they are judged by is what the body follows, the state regressor's motion or a kinematic forecast; the true motion
 plays no part.
 """
@@ -32,6 +34,9 @@ _EPISODE = ("take", "start", "stop", "frame")  # with one number for each body
 Rows = Callable[[Mapping[str, Tensor]], Tensor]
 """Of what an environment writes: which row of what is followed each body should be in, ``[N]`` int64."""
 
+_PARTS = (0.25, 0.5, 0.75)  # of the best way, tried in later rounds
+_ELITES = (2, 4, 8)  # ways whose means are tried
+_NARROWED = 0.5  # of the additions' deviation, about the mean of the second of these
 _BROKEN = 1000.0  # what a way loses whose physics break: more than any sum of rewards
 
 
@@ -69,6 +74,7 @@ class PlannerSettings:
 
     Args:
         samples: ways tried at a time.
+        rounds: of so many ways each, the later ones between and about the best of those before.
         horizon: frames they are simulated for.
         every: frames between plans.
         knot: frames between the knots of an addition, which is linear in between.
@@ -78,6 +84,8 @@ class PlannerSettings:
         head: reward lost per metre by which the head is lower than what is followed has it.
         lost: m; a body whose head is lower than that by more is worth nothing to the fail-safe, whatever its plan.
         margin: reward by which a way must do better than the plan so far to be taken, and either than no addition.
+        near: reward; of ways that are worse than the best by no more, the one that changes least of the plan so far is
+            taken.
         discount: of a frame.
         kappa: of the fail-safe, where it has none of its own, for the values of plans.
         reward: as a file of ``conf/reward`` in the heading frame: how near the body is to what it follows.
@@ -85,6 +93,7 @@ class PlannerSettings:
     """
 
     samples: int
+    rounds: int
     horizon: int
     every: int
     knot: int
@@ -94,6 +103,7 @@ class PlannerSettings:
     head: float
     lost: float
     margin: float
+    near: float
     discount: float
     kappa: float
     reward: Any
@@ -105,11 +115,12 @@ class PlannerSettings:
                 raise InputError("planner", name, cause)
 
         check(self.samples >= 3, "samples", "must be at least 3: without an addition, the plan so far, and a new one")
+        check(self.rounds >= 1, "rounds", "must be at least 1")
         check(0 < self.every <= self.horizon, "every", "must lie between 1 and the horizon")
         check(self.knot > 0, "knot", "must be positive")
         check(min(self.deviation, self.lost) > 0, "deviation", "must be positive, as must lost")
-        least = min(self.acceleration, self.head, self.margin)
-        check(least >= 0, "acceleration", "must not be negative, nor head, nor margin")
+        least = min(self.acceleration, self.head, self.margin, self.near)
+        check(least >= 0, "acceleration", "must not be negative, nor head, margin or near")
         check(0 < self.discount <= 1, "discount", "must lie in (0, 1]")
         kind = self.reward.get("kind") if isinstance(self.reward, Mapping) else None
         check(kind == "heading_frame", "reward", "must be one in the heading frame")
@@ -208,30 +219,67 @@ class Planner:
         """``worlds [n]`` were placed elsewhere: what was planned for them, and their value, hold no more."""
         self._plan[worlds], self._age = 0.0, 0
 
-    def _ways(self) -> Tensor:
-        """``[K, N, H, nu]``: none, the plan so far, changes of it, and ways of their own."""
+    def _additions(self, count: int) -> Tensor:
+        """``[count, N, H, nu]`` additions drawn anew, straight lines between their knots."""
         settings, (worlds, _, size) = self.settings, self._plan.shape
         knots = -(-(settings.horizon - 1) // settings.knot) + 1
-        at_knots = torch.randn(settings.samples, worlds, knots, size, generator=self._generator) * self._deviation
-        at_knots *= 0.1 + 0.9 * torch.rand(settings.samples, worlds, 1, 1, generator=self._generator)
+        at_knots = torch.randn(count, worlds, knots, size, generator=self._generator) * self._deviation
+        at_knots *= 0.1 + 0.9 * torch.rand(count, worlds, 1, 1, generator=self._generator)
         time = torch.arange(settings.horizon) / settings.knot
         left = time.long().clamp(max=max(knots - 2, 0))
         share = (time - left)[:, None]
-        ways = torch.lerp(at_knots[:, :, left], at_knots[:, :, (left + 1).clamp(max=knots - 1)], share)
-        plan = self._plan[:, : settings.horizon]
-        ways[: settings.samples // 2] += plan
+        return torch.lerp(at_knots[:, :, left], at_knots[:, :, (left + 1).clamp(max=knots - 1)], share)
+
+    def _ways(self) -> Tensor:
+        """``[K, N, H, nu]``: none, the plan so far, changes of it, and ways of their own."""
+        ways, plan = self._additions(self.settings.samples), self._plan[:, : self.settings.horizon]
+        ways[: self.settings.samples // 2] += plan
         ways[0], ways[1] = 0.0, plan
         return ways
 
+    def _refined(self, ways: Tensor, score: Tensor) -> Tensor:
+        """``[K, N, H, nu]`` between and about the best of ``ways``, as many or more, by their ``score [>= K, N]``.
+
+        Parts of the best, or of its change of the plan so far, means of the best ones, and the rest about such a mean.
+        """
+        best = ways[score.topk(min(max(_ELITES), len(ways)), dim=0).indices, torch.arange(ways.shape[1])]
+        plan, means = ways[1], [best[:count].mean(0) for count in _ELITES]
+        found = [way for part in _PARTS for way in (torch.lerp(plan, best[0], part), part * best[0])]
+        found += [way for mean in means for way in (mean, 0.5 * mean, torch.lerp(plan, mean, 0.5))]
+        found = found[: self.settings.samples]
+        about = means[1] + _NARROWED * self._additions(self.settings.samples - len(found))
+        return torch.cat([torch.stack(found), about])
+
     @torch.no_grad()
     def _look_ahead(self, base: EgoPoseEnv) -> None:
-        settings, copies, problem = self.settings, self._base, self._base.problem
+        settings, now = self.settings, base.state_dict()
         ways = self._ways()
-        self._copy(base.state_dict())
+        score, worth = self._tried(now, ways)
+        for _ in range(settings.rounds - 1):
+            more = self._refined(ways, score)
+            tried = self._tried(now, more)
+            ways, score, worth = (torch.cat(pair) for pair in zip((ways, score, worth), (more, *tried), strict=True))
+        most, change = score.amax(0), (ways - ways[1]).square().mean((2, 3))
+        best = torch.where(score >= most - settings.near, change, torch.inf).argmin(0)
+        # Chance finds small gains in any noise; to follow each of them is to tremble.
+        enough = most - settings.margin
+        best = torch.where(score[0] >= enough, 0, torch.where(score[1] >= enough, 1, best))
+        worlds = torch.arange(ways.shape[1])
+        self._worth = worth[best, worlds]
+        self._plan[:, : settings.horizon] = ways[best, worlds]
+
+    def _tried(self, now: Mapping[str, Tensor], ways: Tensor) -> tuple[Tensor, Tensor]:
+        """What ``ways [K, N, H, nu]`` come to ``[K, N]`` from the bodies' state ``now``.
+
+        Returns:
+            Rewards less the price of how they are come by, and rewards alone.
+        """
+        settings, copies, problem = self.settings, self._base, self._base.problem
+        self._copy(now)
         seen = Entries(self._env.transform(copies.observe()).items())
         worth = torch.zeros(copies.batch_size[0])
         cost = torch.zeros_like(worth)
-        velocity, rate, kept = copies.physics.qvel.copy(), 1.0 / problem.humanoid.control_dt, 1.0
+        before, rate, kept = copies.physics.qvel.copy(), 1.0 / problem.humanoid.control_dt, 1.0
         for step in range(settings.horizon):
             run_parts(self._actor, seen)
             body, after = copies.try_step(seen[self._action] + ways[:, :, step].flatten(0, 1))
@@ -239,9 +287,9 @@ class Planner:
             followed = SimpleNamespace(**{name: rows.index_select(0, row) for name, rows in self._followed.items()})
             reward, _ = self._reward(body, followed, after["episode_step"].squeeze(-1))
             low = (self._head_height[row] - body.xpos[:, problem.humanoid.head, 2]).clamp(min=0.0)
-            now = body.qvel.numpy()
-            acceleration = torch.from_numpy(np.abs(now - velocity).mean(1) * rate)
-            velocity = now
+            velocity = body.qvel.numpy()
+            acceleration = torch.from_numpy(np.abs(velocity - before).mean(1) * rate)
+            before = velocity
             worth += kept * reward.float()
             cost += kept * (settings.acceleration * acceleration + settings.head * low).float()
             cost += _BROKEN * after["diverged"].squeeze(-1)
@@ -249,14 +297,7 @@ class Planner:
             seen = self._env.transform._step(seen, Entries(after))
         run_parts(self._critic, seen)
         worth += kept * seen["state_value"].squeeze(-1)
-        worlds = torch.arange(ways.shape[1])
-        score, worth = ((rows).unflatten(0, ways.shape[:2]) for rows in (worth - cost, worth))
-        best = score.argmax(0)
-        # Chance finds small gains in any noise; to follow each of them is to tremble.
-        enough = score.amax(0) - settings.margin
-        best = torch.where(score[0] >= enough, 0, torch.where(score[1] >= enough, 1, best))
-        self._worth = worth[best, worlds]
-        self._plan[:, : settings.horizon] = ways[best, worlds]
+        return (worth - cost).unflatten(0, ways.shape[:2]), worth.unflatten(0, ways.shape[:2])
 
     def _copy(self, state: Mapping[str, Tensor]) -> None:
         """Put every body's copies where the body is, in ``state`` of its environment."""

@@ -14,9 +14,11 @@ from collections.abc import Sequence
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from scipy.interpolate import BSpline
 from torch import Tensor, nn
 
+from egopose.models.baselines.recurrent import RecurrentForecaster
 from egopose.models.kernel_regression import KernelRegression
 
 
@@ -31,14 +33,29 @@ def spline_basis(frames: int, spacing: int, fps: float) -> tuple[Tensor, Tensor]
     Raises:
         ValueError: fewer than two frames, or a spacing that is not positive.
     """
-    if frames < 2 or spacing < 1:
-        raise ValueError(f"a spline needs two frames and a positive spacing, got {frames} and {spacing}")
-    inner = np.linspace(0.0, frames - 1.0, max(1, round((frames - 1) / spacing)) + 1)
-    knots = np.concatenate([[inner[0]] * 3, inner, [inner[-1]] * 3])
+    knots = _knots(frames, spacing)
     count = len(knots) - 4
     at = np.arange(frames, dtype=np.float64)
     spline = BSpline(knots, np.eye(count), 3)
     return torch.from_numpy(spline(at)).float(), torch.from_numpy(spline.derivative()(at) * fps).float()
+
+
+def spline_times(frames: int, spacing: int) -> Tensor:
+    """The steps ``[K]`` at which the coefficients of :func:`spline_basis` stand (Greville's abscissae): a straight line
+    has its own values there as coefficients.
+
+    Raises:
+        ValueError: as :func:`spline_basis`.
+    """
+    knots = _knots(frames, spacing)
+    return torch.from_numpy((knots[1:-3] + knots[2:-2] + knots[3:-1]) / 3.0).float()
+
+
+def _knots(frames: int, spacing: int) -> NDArray[np.float64]:
+    if frames < 2 or spacing < 1:
+        raise ValueError(f"a spline needs two frames and a positive spacing, got {frames} and {spacing}")
+    inner = np.linspace(0.0, frames - 1.0, max(1, round((frames - 1) / spacing)) + 1)
+    return np.concatenate([[inner[0]] * 3, inner, [inner[-1]] * 3])
 
 
 class MotionForecaster(nn.Module):
@@ -118,3 +135,40 @@ class KernelForecaster(nn.Module):
         """Context ``[B, C, P]`` in deviations -> coefficients ``[B, K, P]``."""
         added = self.kernel(self.parts(context)).unflatten(-1, self.kept.shape[1:])
         return context[:, -1:] * self.kept[0] + context.mean(dim=1, keepdim=True) * self.kept[1] + added
+
+
+class ContinuedForecaster(nn.Module):
+    """As :class:`MotionForecaster`, but that a network goes on frame by frame, each fed back as the next input.
+
+    The curve is the one nearest to its frames and to the last pose seen.
+
+    What feeds back knows how a motion goes on in the next moments, and drifts later.
+
+    Args:
+        network: trained on poses of the same kind.
+        frames: of the curve, the last one seen among them.
+        spacing, fps: see :func:`spline_basis`.
+    """
+
+    nearest: Tensor
+
+    def __init__(self, network: RecurrentForecaster, frames: int, spacing: int, fps: float) -> None:
+        super().__init__()
+        self.network, self.frames = network, frames
+        inverse = torch.linalg.pinv(spline_basis(frames, spacing, fps)[0].double())
+        self.register_buffer("nearest", inverse.float(), persistent=False)
+
+    @property
+    def mean(self) -> Tensor:
+        """``[P]``, as the others'."""
+        return self.network.mean
+
+    @property
+    def std(self) -> Tensor:
+        """``[P]``, as the others'."""
+        return self.network.std
+
+    def forward(self, context: Tensor) -> Tensor:
+        """Context ``[B, C, P]`` in deviations -> coefficients ``[B, K, P]``."""
+        after = self.network.forecast(self.network.denormalise(context), self.frames - 1)
+        return self.nearest @ torch.cat([context[:, -1:], self.network.normalise(after)], dim=1)

@@ -15,6 +15,7 @@ from egopose.errors import InputError
 from egopose.models.mirror import StateMirror
 from egopose.models.motion_forecast import MotionForecaster, spline_basis
 from egopose.models.regressor import state_statistics
+from egopose.training.continued_forecast import ContinuedSettings
 from egopose.training.fragments import Span, split_validation, without_block
 from egopose.training.kernel_forecast import Contexts, KernelSettings
 
@@ -35,6 +36,7 @@ class ForecasterSettings:
         members: networks whose curves are averaged.
         total_frames: of motion each network learns from, counted as often as they are seen.
         kernel: of the kernel regression beside the networks, or None for networks alone.
+        continued: of the network beside both that goes on frame by frame, or None for none.
     """
 
     recurrent: int
@@ -50,11 +52,12 @@ class ForecasterSettings:
     members: int
     total_frames: int
     kernel: KernelSettings | None = None
+    continued: ContinuedSettings | None = None
 
     @classmethod
     def from_config(cls, values: Mapping[str, Any], source: str = "conf/forecaster") -> ForecasterSettings:
         """Raises InputError: a key is missing, unknown or out of range; names it."""
-        own = {key: value for key, value in values.items() if key != "kernel"}
+        own = {key: value for key, value in values.items() if key not in ("kernel", "continued")}
         settings = from_mapping(cls, own, source)
         if values.get("kernel") is not None:
             kernel = from_mapping(KernelSettings, values["kernel"], f"{source} kernel")
@@ -62,6 +65,9 @@ class ForecasterSettings:
             if sum(kernel.bins) != settings.context:
                 cause = f"must add up to the context's {settings.context} frames, not {sum(kernel.bins)}"
                 raise InputError(f"{source} kernel", "bins", cause)
+        if values.get("continued") is not None:
+            continued = ContinuedSettings.from_config(values["continued"], f"{source} continued")
+            settings = replace(settings, continued=continued)
         if settings.context > settings.horizon:  # what is left out about a block is as wide as the horizon
             raise InputError(source, "context", f"must be at most the horizon, {settings.horizon} frames")
         least = {"recurrent": 1, "hidden": 1, "spacing": 1, "context": 1, "horizon": 2, "cross_fit": 2, "members": 1}

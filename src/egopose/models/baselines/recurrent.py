@@ -56,8 +56,8 @@ class RecurrentForecaster(nn.Module):
         residual: bool,
     ) -> None:
         super().__init__()
-        self.register_buffer("mean", mean.to(torch.float32))
-        self.register_buffer("std", std.to(torch.float32))
+        self.register_buffer("mean", mean.to(torch.float32, copy=True))
+        self.register_buffer("std", std.to(torch.float32, copy=True))
         self.residual = residual
         self.encoder, width = _layers(len(mean), encoder)
         self.lstm = nn.LSTM(width, recurrent, layers, batch_first=True)
