@@ -74,8 +74,8 @@ def write_table() -> None:
     lines = [
         "# Looking ahead: what was tried",
         "",
-        "*Written by `trial.py` from `raw/`; do not edit.* Training takes drawn by chance, states of regressors that have",
-        "not seen them; the policy is that of `ours-cross-without2-seed0` of [the study](../study/README.md).",
+        "*Written by `trial.py` from `raw/`; do not edit.* Training takes drawn by chance, states of regressors that",
+        "have not seen them; the policy is that of `ours-cross-without2-seed0` of [the study](../study/README.md).",
         "",
         "```bash",
         "python experiments/planner/trial.py RUN_DIR",
@@ -84,7 +84,7 @@ def write_table() -> None:
         "| planner | E_pose | E_vel | A_accl | resets | fallen frames | takes | frames |",
         "| --- | ---: | ---: | ---: | ---: | ---: | ---: | ---: |",
     ]
-    for name in read_yaml(HERE / "trial.yaml"):
+    for name in read_yaml(HERE / "trial.yaml", "rows"):
         if (path := raw(name)).is_file():
             d = json.loads(path.read_text())
             numbers = " | ".join(f"{d[key]:.3f}" for key in FIGURES)
@@ -105,7 +105,7 @@ def main() -> None:
     given = parser.parse_args()
     agent = load_agent(given.run, which="latest")
     fragments = drawn(agent.material.train, given.frames, given.seed)
-    for name, changes in read_yaml(HERE / "trial.yaml").items():
+    for name, changes in read_yaml(HERE / "trial.yaml", "rows").items():
         if raw(name).is_file() or not fnmatch.fnmatch(name, given.only):
             continue
         found = figures(row(agent, fragments, changes))
