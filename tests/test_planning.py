@@ -32,7 +32,8 @@ from egopose.inference.planning import Planner, PlannerSettings, planner_setting
 
 FRAMES = 60
 PIECES = (Piece(0, 0, FRAMES), Piece(1, 0, FRAMES))
-SMALL = {"samples": 12, "horizon": 8, "every": 8, "knot": 3, "acceleration": 0.001}
+#: A search in one round, its best way taken.
+SMALL = {"samples": 12, "rounds": 1, "near": 0.0, "horizon": 8, "every": 8, "knot": 3, "acceleration": 0.001}
 humanoid = cache(stand_in)
 
 
@@ -165,10 +166,11 @@ def test_a_body_that_falls_alone_stays_up_longer() -> None:
         assert upright > 1.3 * np.argmax(one.fallen)
 
 
-def test_the_value_is_what_a_plain_simulation_of_the_chosen_way_is_worth() -> None:
+@pytest.mark.parametrize("rounds", [1, 3])
+def test_the_value_is_what_a_plain_simulation_of_the_chosen_way_is_worth(rounds: int) -> None:
     followed = other_motion()
     base = leaning(make_env(2))
-    planner = planner_for(2, states_of(followed))
+    planner = planner_for(2, states_of(followed), rounds=rounds)
     worth, score = simulated(base, whole_way(planner, base), followed, planner.settings)
     torch.testing.assert_close(planner.value, worth.float(), rtol=0, atol=1e-4)
     nothing = torch.zeros(2, planner.settings.horizon, humanoid().mj_model.nu)
@@ -225,7 +227,7 @@ def test_small_gains_change_nothing() -> None:
 
 def test_only_what_balances_is_added_to_and_smoothly() -> None:
     base = leaning(make_env(2))
-    planner = planner_for(2, states_of(true_motion()[0]), joints=["Leg"], knot=4, horizon=9, every=9)
+    planner = planner_for(2, states_of(true_motion()[0]), joints=["Leg"], knot=4, horizon=9, every=9, rounds=3)
     way = whole_way(planner, base)
     names = [joint.name for joint in humanoid().skeleton.joints for _ in joint.dofs]
     legs = torch.tensor(["Leg" in name for name in names])
@@ -239,7 +241,7 @@ def test_only_what_balances_is_added_to_and_smoothly() -> None:
 
 def test_planning_touches_nothing_of_the_body_it_is_for() -> None:
     base = leaning(make_env(2))
-    planner = planner_for(2, states_of(other_motion()))
+    planner = planner_for(2, states_of(other_motion()), rounds=2)
     before = {name: value.clone() for name, value in base.state_dict().items()}
     planner.addition(base)
     after = base.state_dict()
@@ -250,7 +252,7 @@ def test_planning_touches_nothing_of_the_body_it_is_for() -> None:
 def test_the_same_seed_gives_the_same_estimate_whatever_the_threads() -> None:
     states = states_of(other_motion())
     one, two, other = (
-        run(planner_for(2, states, env={"threads": threads}, every=4, seed=seed), states, actor())
+        run(planner_for(2, states, env={"threads": threads}, every=4, seed=seed, rounds=2), states, actor())
         for threads, seed in ((1, 3), (2, 3), (1, 4))
     )
     for a, b, c in zip(one, two, other, strict=True):
@@ -265,7 +267,7 @@ def test_the_true_motion_plays_no_part() -> None:
     additions = []
     for reference in (true, altered):
         base = leaning(make_env(2, reference))
-        planner = planner_for(2, states, env={"reference": reference})
+        planner = planner_for(2, states, env={"reference": reference}, rounds=2)
         additions.append((whole_way(planner, base), planner.value))
     assert not torch.equal(true["qpos"], altered["qpos"])
     for one, two in zip(*additions, strict=True):
@@ -307,10 +309,172 @@ def test_a_restart_by_the_fail_safe_is_planned_for() -> None:
     )
 
 
+# --- rounds ----------------------------------------------------------------------------------------------------------
+
+
+def tries_of(planner: Planner) -> list[tuple[Tensor, Tensor]]:
+    """Ways and their scores, a round at a time, filled while the planner plans."""
+    tries: list[tuple[Tensor, Tensor]] = []
+    tried = planner._tried
+
+    def spied(now: Any, ways: Tensor) -> tuple[Tensor, Tensor]:
+        score, worth = tried(now, ways)
+        tries.append((ways.clone(), score.clone()))
+        return score, worth
+
+    planner._tried = spied  # type: ignore[method-assign]
+    return tries
+
+
+def some_plan(planner: Planner, size: float = 0.05) -> Tensor:
+    """A plan so far that moves all that may be added to, ``[N, H, nu]``."""
+    generator = torch.Generator().manual_seed(5)
+    plan = size * torch.randn(planner._plan.shape, generator=generator) * planner._deviation.bool()
+    planner._plan.copy_(plan)
+    return plan[:, : planner.settings.horizon].clone()
+
+
+def taken(score: Tensor, ways: Tensor, chosen: PlannerSettings) -> list[int]:
+    """The way for each body by the words of the settings: none, the plan so far, or the one near the best that changes
+    least."""
+    out = []
+    for body, points in enumerate(score.T.tolist()):
+        change = [float((way[body] - ways[1, body]).square().mean()) for way in ways]
+        near = [k for k, point in enumerate(points) if point >= max(points) - chosen.near]
+        first = [k for k in (0, 1) if points[k] >= max(points) - chosen.margin]
+        out.append(first[0] if first else min(near, key=lambda k: change[k]))
+    return out
+
+
+def test_every_round_is_judged_as_a_plain_simulation_does_and_the_one_near_the_best_is_taken() -> None:
+    followed, base = other_motion(), leaning(make_env(2))
+    for near in (0.0, 0.15):
+        planner = planner_for(2, states_of(followed), samples=5, rounds=3, near=near, margin=0.0)
+        some_plan(planner, 0.3)
+        tries = tries_of(planner)
+        way = whole_way(planner, base)
+        assert [len(ways) for ways, _ in tries] == [5, 5, 5]
+        ways = torch.cat([ways for ways, _ in tries])
+        worth, score = (
+            torch.stack(values)
+            for values in zip(*(simulated(base, one, followed, planner.settings) for one in ways), strict=True)
+        )
+        torch.testing.assert_close(torch.cat([one for _, one in tries]), score.float(), rtol=0, atol=1e-4)
+        best = taken(score, ways, planner.settings)
+        assert torch.equal(way, ways[best, [0, 1]])
+        torch.testing.assert_close(planner.value, worth[best, [0, 1]].float(), rtol=0, atol=1e-4)
+        assert (score[best, [0, 1]] >= score[:5].amax(0) - near - 1e-4).all()
+        if near:
+            assert (score[best, [0, 1]] < score.amax(0) - 1e-3).any(), "or near changes nothing here"
+
+
+def test_more_rounds_from_the_same_state_and_seed_find_no_worse_way_and_some_better_ones() -> None:
+    followed, base = other_motion(), leaning(make_env(2))
+    gains = []
+    for seed in range(2):
+        found = []
+        for rounds in (1, 3):
+            planner = planner_for(2, states_of(followed), rounds=rounds, seed=seed, margin=0.0)
+            found.append(simulated(base, whole_way(planner, base), followed, planner.settings)[1])
+        gains.append(found[1] - found[0])
+    assert torch.stack(gains).min() >= -1e-4
+    assert (torch.stack(gains) > 1e-2).any(), "or there was nothing better to find"
+
+
+def test_with_all_ways_near_the_plan_so_far_is_kept_unless_none_is_within_the_margin() -> None:
+    followed, base = other_motion(), leaning(make_env(2))
+    planner = planner_for(2, states_of(followed), samples=6, rounds=3, near=1e6, margin=0.0)
+    plan, tries = some_plan(planner), tries_of(planner)
+    kept = whole_way(planner, base)
+    assert plan.any()
+    score = torch.cat([one for _, one in tries])
+    assert (score[0] < score.amax(0)).all()
+    assert (score[1] < score.amax(0)).all()
+    assert torch.equal(kept, plan)
+    wide = planner_for(2, states_of(followed), samples=6, rounds=3, near=1e6, margin=1e5)
+    some_plan(wide)
+    assert not whole_way(wide, base).any()
+
+
+@pytest.mark.parametrize(("near", "margin"), [(0.0, 0.0), (0.5, 0.0), (0.5, 0.2), (0.1, 0.3), (0.0, 0.2)])
+def test_of_any_scores_none_and_the_plan_so_far_come_first_within_the_margin(near: float, margin: float) -> None:
+    bodies, base = 40, SimpleNamespace(state_dict=dict)
+    planner = planner_for(bodies, states_of(true_motion()[0]), samples=4, rounds=3, near=near, margin=margin)
+    plan, seen, points = some_plan(planner), list[Tensor](), list[Tensor]()
+
+    def scored(_: Any, ways: Tensor) -> tuple[Tensor, Tensor]:
+        seen.append(ways.clone())
+        points.append(torch.rand(ways.shape[:2], generator=torch.Generator().manual_seed(len(points))))
+        return points[-1], 10 + points[-1]
+
+    planner._tried = scored  # type: ignore[method-assign]
+    planner._look_ahead(base)  # type: ignore[arg-type]
+    ways, score = torch.cat(seen), torch.cat(points)
+    assert torch.equal(ways[1], plan)
+    best, worlds = taken(score, ways, planner.settings), torch.arange(bodies)
+    assert torch.equal(planner._plan[:, : planner.settings.horizon], ways[best, worlds])
+    assert torch.equal(planner._worth, 10 + score[best, worlds])
+    # All that can be taken is: the two that come first, and ways of every round.
+    assert len({k // 4 for k in best}) == 3
+    assert {0, 1} <= set(best)
+    assert len(set(best)) > 2
+
+
+def judged(count: int, bodies: int, plan: Tensor) -> tuple[Tensor, Tensor]:
+    """Ways drawn at random, the second the plan so far, and scores of which no body's best are another's."""
+    generator = torch.Generator().manual_seed(count)
+    ways = torch.randn(count, *plan.shape, generator=generator)
+    ways[1] = plan
+    return ways, torch.stack([torch.randperm(count, generator=generator).float() for _ in range(bodies)], dim=1)
+
+
+def between(ways: Tensor, score: Tensor, body: int) -> list[Tensor]:
+    """What a later round tries of a body's ways ``[K, H, nu]`` whatever chance says, by the method's words."""
+    order = sorted(range(len(ways)), key=lambda k: -float(score[k, body]))
+    best, plan, nothing = ways[order[0], body], ways[1, body], torch.zeros_like(ways[1, body])
+    out = [other + part * (best - other) for part in (0.25, 0.5, 0.75) for other in (plan, nothing)]
+    for count in (2, 4, 8):
+        mean = ways[order[:count], body].mean(0)
+        out += [mean, 0.5 * mean, (plan + mean) / 2]
+    return out
+
+
+def holds(rows: Tensor, wanted: Tensor) -> bool:
+    return bool(((rows - wanted).abs().amax(dim=(1, 2)) < 1e-5).any())
+
+
+@pytest.mark.parametrize(("samples", "known"), [(20, 20), (20, 60), (15, 15), (9, 9), (3, 3), (3, 9)])
+def test_a_later_round_tries_what_lies_between_and_about_the_best(samples: int, known: int) -> None:
+    """Fewer samples than ways between: some of these; more: the rest, about the mean of the best four."""
+    planner = planner_for(2, states_of(true_motion()[0]), samples=samples)
+    ways, score = judged(known, 2, some_plan(planner))
+    start = planner._generator.get_state()
+    more = planner._refined(ways, score)
+    assert more.shape == (samples, *ways.shape[1:])
+    planner._generator.set_state(start)
+    drawn = planner._additions(max(samples - 15, 0))
+    for body in range(2):
+        wanted = between(ways, score, body)
+        if samples >= len(wanted):
+            assert all(holds(more[:, body], one) for one in wanted)
+        else:
+            assert all(holds(torch.stack(wanted), one) for one in more[:, body])
+        for row, addition in zip(more[15:, body], drawn[:, body], strict=True):
+            torch.testing.assert_close(row, wanted[9] + 0.5 * addition)
+    # A change of one body's scores is a change of its ways alone.
+    score[:, 1] = score[:, 1].flip(0)
+    planner._generator.set_state(start)
+    again = planner._refined(ways, score)
+    assert torch.equal(again[:, 0], more[:, 0])
+    assert not torch.equal(again[:, 1], more[:, 1])
+
+
 @pytest.mark.parametrize(
     ("changed", "field"),
     [
         ({"samples": 2}, "samples"),
+        ({"rounds": 0}, "rounds"),
+        ({"rounds": 1.5}, "rounds"),
         ({"horizon": 1}, "every"),
         ({"every": 0}, "every"),
         ({"knot": 0}, "knot"),
@@ -318,6 +482,7 @@ def test_a_restart_by_the_fail_safe_is_planned_for() -> None:
         ({"acceleration": -1.0}, "acceleration"),
         ({"head": -1.0}, "head"),
         ({"margin": -1.0}, "margin"),
+        ({"near": -0.1}, "near"),
         ({"discount": 0.0}, "discount"),
         ({"discount": 1.1}, "discount"),
         ({"reward": None}, "reward"),
