@@ -14,6 +14,7 @@ import torch
 from env_stand_in import group
 from humanoid_stand_in import stand_in
 from test_blended import KERNEL, blended
+from test_continued_forecaster import continued
 from test_material import configuration, fill_flow
 from test_motion_forecast import FPS, SMALL, contexts_of, settings, unmirrored, wave
 from torch import Tensor, nn
@@ -29,7 +30,7 @@ from egopose.inference.context_states import context_states
 from egopose.material import Material, take_table
 from egopose.models.kernel_regression import fit_kernel_regression
 from egopose.models.mirror import StateMirror, state_mirror
-from egopose.models.motion_forecast import KernelForecaster, spline_basis
+from egopose.models.motion_forecast import KernelForecaster, spline_basis, spline_times
 from egopose.motion_forecasts import FOLDER, PARTS, ForecastCurves, Members, with_futures
 from egopose.regression import load_regressor, regressor_name, regressor_tables, training_contexts
 from egopose.ship import _copy_components
@@ -37,6 +38,7 @@ from egopose.training import blending
 from egopose.training import past_contexts as past
 from egopose.training.blending import KernelSettings
 from egopose.training.checkpoint import ComponentState, RunCheckpoint, has_component, metadata_of
+from egopose.training.continued_forecast import continued_share
 from egopose.training.fragments import Span, cross_fit_blocks
 from egopose.training.kernel_forecast import Contexts, blank_kernel_forecaster, fit_kernel_forecaster
 from egopose.training.motion_forecast import ForecastLearner, build_forecaster, cross_fit_starts
@@ -396,6 +398,111 @@ def test_a_run_learns_keeps_and_reads_back_networks_and_kernel(
     assert afresh is not None
     assert len(afresh.starts) == 0
     assert (afresh.coefficients.shape[1:], afresh.horizon) == (futures.coefficients.shape[1:], 6)
+
+
+def test_a_run_with_one_that_goes_on_frame_by_frame_learns_keeps_ships_and_reads_it_back(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config, store = stored(folder), TakeStore.open(folder / "store")
+    config["forecaster"]["members"] = 1
+    config["forecaster"]["continued"] = continued(share=0.4, until=5)
+    material = material_of(config, store)
+    assert material.states is not None
+    size, noisy = 11 + material.humanoid.mj_model.nu, material.states + 0.1 * torch.randn(material.states.shape)
+    monkeypatch.setattr(
+        motion_forecasts, "training_contexts",
+        lambda _, __, ___, ____, starts, context: noisy[starts[:, None] + torch.arange(1 - context, 1)],
+    )  # fmt: skip
+    asked: list[Any] = []
+    made_of: dict[str, list[Any]] = {name: [] for name in ("fit", "fit_kernel_forecaster", "fit_continued_forecaster")}
+
+    def spied(name: str) -> Any:
+        fitted = getattr(motion_forecasts, name)
+
+        def learned(*given: Any) -> Any:
+            out = fitted(*given)
+            if name == "fit_continued_forecaster":
+                asked.append(given)
+            result = out[0] if isinstance(out, tuple) else out
+            made_of[name].append(given[0].model if name == "fit" else result)
+            return out
+
+        return learned
+
+    for name in made_of:
+        monkeypatch.setattr(motion_forecasts, name, spied(name))
+    run = tmp_path / "run"
+    futures = with_futures(config, material, run).futures
+    assert futures is not None
+    networks, kernels, others = made_of.values()
+    assert (len(networks), len(kernels), len(others)) == (3, 3, 3)
+    # What it learns from are true poses, of all training frames, or of those apart from the block it tells of.
+    whole, made = [Span(0, 38), Span(38, 77)], motion_forecasts._settings(config)[0]
+    parts = cross_fit_starts(whole, cross_fit_blocks(whole, 2), made)
+    assert [given[1] for given in asked] == [whole, *(rest for rest, _ in parts)]
+    for truth, _, mirror, given, fps, seed in asked:
+        assert torch.equal(truth, material.states[:, :size])
+        assert torch.equal(mirror.index, state_mirror(material.humanoid.skeleton).poses().index)
+        assert (given, fps, seed) == (made, 1 / material.humanoid.control_dt, config["seed"])
+
+    share = torch.tensor([max(0.0, 0.4 * (1 - float(t) / 5)) for t in spline_times(7, SMALL["spacing"])])[:, None]
+    assert share[0] == 0.4
+    assert share[-1] == 0
+
+    @torch.no_grad()
+    def by_hand(number: int, contexts: Tensor) -> Tensor:
+        one = others[number]
+        curve = one((contexts - one.mean) / one.std) * one.std + one.mean
+        return (1 - share) * mixed(networks[number : number + 1], kernels[number], 0.3, contexts) + share * curve
+
+    for number, (_, starts) in enumerate(parts, start=1):
+        contexts = noisy[starts[:, None] + torch.arange(1 - CONTEXT, 1), :size]
+        found = futures.coefficients[torch.isin(futures.starts, starts)]
+        torch.testing.assert_close(found, by_hand(number, contexts), atol=1e-4, rtol=1e-4)
+
+    # Read back, here or where it was shipped to, it is exactly what was learned.
+    kept = motion_forecasts._members(made, run / FOLDER, size, FPS)
+    for before, read in zip(
+        (networks[0], kernels[0], others[0]), (kept.networks[0], kept.kernel, kept.continued), strict=True
+    ):
+        assert isinstance(read, nn.Module)
+        assert before.state_dict().keys() == read.state_dict().keys()
+        assert all(torch.equal(value, read.state_dict()[key]) for key, value in before.state_dict().items())
+        assert not read.training
+    own = [value for part in (kept.networks[0], kept.kernel, kept.continued) for value in (part.mean, part.std)]  # type: ignore[union-attr]
+    assert len({value.data_ptr() for value in own}) == len(own), "each has statistics of its own"
+    pasts = torch.randn(3, CONTEXT, material.states.shape[1]).cumsum(1)
+    learned = Members(networks[:1], kernels[0], 0.3, others[0], continued_share(made))
+    told = ForecastCurves(config, material, run)(pasts)
+    seen = pasts[..., :size]
+    assert kept.continued is not None
+    with torch.no_grad():
+        assert torch.equal(kept.continued(seen), others[0](seen))
+    # The kernel's rows lie otherwise in memory: its last digits may differ.
+    torch.testing.assert_close(told, motion_forecasts._curves(learned, seen), atol=1e-5, rtol=1e-6)
+    torch.testing.assert_close(told, by_hand(0, seen), atol=1e-4, rtol=1e-4)
+    without = mixed(networks[:1], kernels[0], 0.3, seen)
+    assert (told - without)[:, 0].abs().max() > 0.05
+    torch.testing.assert_close(told[:, -1], without[:, -1], atol=1e-4, rtol=1e-4)
+    there = [name for name in PARTS if has_component(run / FOLDER, name)]
+    assert there == ["members", "kernel", "sizes", "continued"]
+    _copy_components(run / FOLDER, tmp_path / "shipped" / FOLDER, there)
+    assert torch.equal(ForecastCurves(config, material, tmp_path / "shipped")(pasts), told)
+    for name in made_of:
+        monkeypatch.setattr(motion_forecasts, name, lambda *_: pytest.fail("learned twice"))
+    again = with_futures(config, material, run).futures
+    assert again is not None
+    assert torch.equal(again.coefficients, futures.coefficients)
+
+    # A run's folder without it is no run of these settings.
+    _copy_components(run / FOLDER, tmp_path / "less" / FOLDER, there[:-1])
+    with pytest.raises(InputError, match="continued"):
+        ForecastCurves(config, material, tmp_path / "less")
+    # Settings without it, as of runs from before there was one, read what such a run kept.
+    forecaster = config["forecaster"]
+    for older in ({**forecaster, "continued": None}, {k: v for k, v in forecaster.items() if k != "continued"}):
+        found = ForecastCurves({**config, "forecaster": older}, material, tmp_path / "less")(pasts)
+        torch.testing.assert_close(found, without, atol=1e-5, rtol=1e-5)
 
 
 def test_a_run_from_before_there_was_a_kernel_forecasts_by_its_networks_alone(folder: Path, tmp_path: Path) -> None:
