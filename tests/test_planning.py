@@ -402,7 +402,7 @@ def test_of_any_scores_none_and_the_plan_so_far_come_first_within_the_margin(nea
     planner = planner_for(bodies, states_of(true_motion()[0]), samples=4, rounds=3, near=near, margin=margin)
     plan, seen, points = some_plan(planner), list[Tensor](), list[Tensor]()
 
-    def scored(_: Any, ways: Tensor) -> tuple[Tensor, Tensor]:
+    def scored(now: Any, ways: Tensor) -> tuple[Tensor, Tensor]:
         seen.append(ways.clone())
         points.append(torch.rand(ways.shape[:2], generator=torch.Generator().manual_seed(len(points))))
         return points[-1], 10 + points[-1]

@@ -105,6 +105,7 @@ def main() -> None:
     given = parser.parse_args()
     agent = load_agent(given.run, which="latest")
     fragments = drawn(agent.material.train, given.frames, given.seed)
+    agent = replace(agent, material=replace(agent.material, train=fragments))
     for name, changes in read_yaml(HERE / "trial.yaml", "rows").items():
         if raw(name).is_file() or not fnmatch.fnmatch(name, given.only):
             continue

@@ -71,7 +71,7 @@ def run(overrides: Sequence[str], rounds: int) -> dict[str, Any]:
     columns = {"plan_ms": planned, "physics_ms": bare, "ratio": ratios, "cpu_ratio": cpu_ratios}
     return {
         **{name: statistics.median(column[1:]) for name, column in columns.items()},  # the first round warms up
-        "control_steps": settings.samples * settings.horizon / settings.every,
+        "control_steps": settings.rounds * settings.samples * settings.horizon / settings.every,
         "substeps": physics.substeps,
         "threads": threads,
         "rounds": rounds,

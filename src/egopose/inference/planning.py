@@ -75,6 +75,8 @@ class PlannerSettings:
     Args:
         samples: ways tried at a time.
         rounds: of so many ways each, the later ones between and about the best of those before.
+        rescue: further rounds at most, as long as some body's best way ends with its head lower by ``sinking`` (m) than
+            what is followed has it; by turns drawn anew and about the best, the deviation ``wider`` times as large.
         horizon: frames they are simulated for.
         every: frames between plans.
         knot: frames between the knots of an addition, which is linear in between.
@@ -94,6 +96,9 @@ class PlannerSettings:
 
     samples: int
     rounds: int
+    rescue: int
+    sinking: float
+    wider: float
     horizon: int
     every: int
     knot: int
@@ -115,10 +120,11 @@ class PlannerSettings:
                 raise InputError("planner", name, cause)
 
         check(self.samples >= 3, "samples", "must be at least 3: without an addition, the plan so far, and a new one")
-        check(self.rounds >= 1, "rounds", "must be at least 1")
+        check(self.rounds >= 1 and self.rescue >= 0, "rounds", "must be at least 1, and rescue not negative")
         check(0 < self.every <= self.horizon, "every", "must lie between 1 and the horizon")
         check(self.knot > 0, "knot", "must be positive")
-        check(min(self.deviation, self.lost) > 0, "deviation", "must be positive, as must lost")
+        least = min(self.deviation, self.lost, self.sinking, self.wider)
+        check(least > 0, "deviation", "must be positive, as must lost, sinking and wider")
         least = min(self.acceleration, self.head, self.margin, self.near)
         check(least >= 0, "acceleration", "must not be negative, nor head, margin or near")
         check(0 < self.discount <= 1, "discount", "must lie in (0, 1]")
@@ -219,11 +225,11 @@ class Planner:
         """``worlds [n]`` were placed elsewhere: what was planned for them, and their value, hold no more."""
         self._plan[worlds], self._age = 0.0, 0
 
-    def _additions(self, count: int) -> Tensor:
+    def _additions(self, count: int, wider: float = 1.0) -> Tensor:
         """``[count, N, H, nu]`` additions drawn anew, straight lines between their knots."""
         settings, (worlds, _, size) = self.settings, self._plan.shape
         knots = -(-(settings.horizon - 1) // settings.knot) + 1
-        at_knots = torch.randn(count, worlds, knots, size, generator=self._generator) * self._deviation
+        at_knots = torch.randn(count, worlds, knots, size, generator=self._generator) * (wider * self._deviation)
         at_knots *= 0.1 + 0.9 * torch.rand(count, worlds, 1, 1, generator=self._generator)
         time = torch.arange(settings.horizon) / settings.knot
         left = time.long().clamp(max=max(knots - 2, 0))
@@ -237,7 +243,7 @@ class Planner:
         ways[0], ways[1] = 0.0, plan
         return ways
 
-    def _refined(self, ways: Tensor, score: Tensor) -> Tensor:
+    def _refined(self, ways: Tensor, score: Tensor, wider: float = 1.0) -> Tensor:
         """``[K, N, H, nu]`` between and about the best of ``ways``, as many or more, by their ``score [>= K, N]``.
 
         Parts of the best, or of its change of the plan so far, means of the best ones, and the rest about such a mean.
@@ -247,38 +253,47 @@ class Planner:
         found = [way for part in _PARTS for way in (torch.lerp(plan, best[0], part), part * best[0])]
         found += [way for mean in means for way in (mean, 0.5 * mean, torch.lerp(plan, mean, 0.5))]
         found = found[: self.settings.samples]
-        about = means[1] + _NARROWED * self._additions(self.settings.samples - len(found))
+        about = means[1] + _NARROWED * self._additions(self.settings.samples - len(found), wider)
         return torch.cat([torch.stack(found), about])
 
     @torch.no_grad()
     def _look_ahead(self, base: EgoPoseEnv) -> None:
         settings, now = self.settings, base.state_dict()
         ways = self._ways()
-        score, worth = self._tried(now, ways)
-        for _ in range(settings.rounds - 1):
-            more = self._refined(ways, score)
+        score, worth, low = self._tried(now, ways)
+        worlds = torch.arange(ways.shape[1])
+        for number in range(settings.rounds - 1 + settings.rescue):
+            rescue = number - (settings.rounds - 1)
+            if rescue < 0:
+                more = self._refined(ways, score)
+            elif not (low[score.argmax(0), worlds] > settings.sinking).any():
+                break
+            else:  # what balances a body does not catch one that falls
+                wide = settings.wider
+                more = self._refined(ways, score, wide) if rescue % 2 else self._additions(settings.samples, wide)
             tried = self._tried(now, more)
-            ways, score, worth = (torch.cat(pair) for pair in zip((ways, score, worth), (more, *tried), strict=True))
+            pairs = zip((ways, score, worth, low), (more, *tried), strict=True)
+            ways, score, worth, low = (torch.cat(pair) for pair in pairs)
         most, change = score.amax(0), (ways - ways[1]).square().mean((2, 3))
         best = torch.where(score >= most - settings.near, change, torch.inf).argmin(0)
         # Chance finds small gains in any noise; to follow each of them is to tremble.
         enough = most - settings.margin
         best = torch.where(score[0] >= enough, 0, torch.where(score[1] >= enough, 1, best))
-        worlds = torch.arange(ways.shape[1])
         self._worth = worth[best, worlds]
         self._plan[:, : settings.horizon] = ways[best, worlds]
 
-    def _tried(self, now: Mapping[str, Tensor], ways: Tensor) -> tuple[Tensor, Tensor]:
+    def _tried(self, now: Mapping[str, Tensor], ways: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """What ``ways [K, N, H, nu]`` come to ``[K, N]`` from the bodies' state ``now``.
 
         Returns:
-            Rewards less the price of how they are come by, and rewards alone.
+            Rewards less the price of how they are come by; rewards alone; and by how many metres the head ends lower
+            than what is followed has it.
         """
         settings, copies, problem = self.settings, self._base, self._base.problem
         self._copy(now)
         seen = Entries(self._env.transform(copies.observe()).items())
         worth = torch.zeros(copies.batch_size[0])
-        cost = torch.zeros_like(worth)
+        cost, low = torch.zeros_like(worth), torch.zeros_like(worth)
         before, rate, kept = copies.physics.qvel.copy(), 1.0 / problem.humanoid.control_dt, 1.0
         for step in range(settings.horizon):
             run_parts(self._actor, seen)
@@ -297,7 +312,8 @@ class Planner:
             seen = self._env.transform._step(seen, Entries(after))
         run_parts(self._critic, seen)
         worth += kept * seen["state_value"].squeeze(-1)
-        return (worth - cost).unflatten(0, ways.shape[:2]), worth.unflatten(0, ways.shape[:2])
+        score, worth, low = (rows.unflatten(0, ways.shape[:2]) for rows in (worth - cost, worth, low.float()))
+        return score, worth, low
 
     def _copy(self, state: Mapping[str, Tensor]) -> None:
         """Put every body's copies where the body is, in ``state`` of its environment."""
