@@ -33,7 +33,16 @@ from egopose.inference.planning import Planner, PlannerSettings, planner_setting
 FRAMES = 60
 PIECES = (Piece(0, 0, FRAMES), Piece(1, 0, FRAMES))
 #: A search in one round, its best way taken.
-SMALL = {"samples": 12, "rounds": 1, "near": 0.0, "horizon": 8, "every": 8, "knot": 3, "acceleration": 0.001}
+SMALL = {
+    "samples": 12,
+    "rounds": 1,
+    "near": 0.0,
+    "horizon": 8,
+    "every": 8,
+    "knot": 3,
+    "acceleration": 0.001,
+    "rescue": 0,
+}
 humanoid = cache(stand_in)
 
 
@@ -317,10 +326,10 @@ def tries_of(planner: Planner) -> list[tuple[Tensor, Tensor]]:
     tries: list[tuple[Tensor, Tensor]] = []
     tried = planner._tried
 
-    def spied(now: Any, ways: Tensor) -> tuple[Tensor, Tensor]:
-        score, worth = tried(now, ways)
+    def spied(now: Any, ways: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        score, worth, low = tried(now, ways)
         tries.append((ways.clone(), score.clone()))
-        return score, worth
+        return score, worth, low
 
     planner._tried = spied  # type: ignore[method-assign]
     return tries
@@ -402,10 +411,10 @@ def test_of_any_scores_none_and_the_plan_so_far_come_first_within_the_margin(nea
     planner = planner_for(bodies, states_of(true_motion()[0]), samples=4, rounds=3, near=near, margin=margin)
     plan, seen, points = some_plan(planner), list[Tensor](), list[Tensor]()
 
-    def scored(now: Any, ways: Tensor) -> tuple[Tensor, Tensor]:
+    def scored(now: Any, ways: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         seen.append(ways.clone())
         points.append(torch.rand(ways.shape[:2], generator=torch.Generator().manual_seed(len(points))))
-        return points[-1], 10 + points[-1]
+        return points[-1], 10 + points[-1], 0 * points[-1]
 
     planner._tried = scored  # type: ignore[method-assign]
     planner._look_ahead(base)  # type: ignore[arg-type]
@@ -475,6 +484,7 @@ def test_a_later_round_tries_what_lies_between_and_about_the_best(samples: int, 
         ({"samples": 2}, "samples"),
         ({"rounds": 0}, "rounds"),
         ({"rounds": 1.5}, "rounds"),
+        ({"rescue": -1}, "rescue"),
         ({"horizon": 1}, "every"),
         ({"every": 0}, "every"),
         ({"knot": 0}, "knot"),
@@ -551,3 +561,80 @@ def test_estimates_plan_unless_they_are_causal_or_told_not_to() -> None:
     for name, words in (("evaluate", []), ("estimate", ["video=none"])):
         without = compose_config(name, ["checkpoint=none", "planner=none", *words])
         assert planner_settings(without.get("planner")) is None
+
+
+# --- rescue ----------------------------------------------------------------------------------------------------------
+
+
+def sinking_tries(planner: Planner, lows: list[list[float]]) -> list[Tensor]:
+    """Ways tried, a round at a time; the best of each round is its last, better than any before, and ends that low."""
+    tried: list[Tensor] = []
+
+    def told(now: Any, ways: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        number = len(tried)
+        tried.append(ways.clone())
+        score = torch.full(ways.shape[:2], -100.0)
+        score[-1] = float(number)
+        low = torch.full(ways.shape[:2], 5.0)
+        low[-1] = torch.tensor(lows[min(number, len(lows) - 1)])
+        return score, score, low
+
+    planner._tried = told  # type: ignore[method-assign]
+    return tried
+
+
+@pytest.mark.parametrize(
+    ("lows", "rounds"),
+    [
+        ([[0.1, 0.2]], 2),  # none sinks by more than asked
+        ([[9.0, 9.0], [0.0, 0.0]], 2),  # only the best of all counts, after the usual rounds
+        ([[0.0, 0.0], [0.0, 0.21]], 5),  # one that sinks is enough, to the end
+        ([[0.0, 0.0], [0.3, 0.0], [0.0, 0.3], [0.1, 0.1]], 4),  # until none does
+    ],
+)
+def test_further_rounds_are_tried_as_long_as_a_body_sinks_in_its_best_way(lows: list[list[float]], rounds: int) -> None:
+    changes: dict[str, Any] = {"samples": 20, "rounds": 2, "rescue": 3, "sinking": 0.2, "wider": 4.0}
+    planner = planner_for(2, states_of(true_motion()[0]), **changes)
+    tried = sinking_tries(planner, lows)
+    planner._look_ahead(SimpleNamespace(state_dict=dict))  # type: ignore[arg-type]
+    assert [len(ways) for ways in tried] == [20] * rounds
+    best = tried[-1][-1]
+    assert torch.equal(planner._plan[:, : planner.settings.horizon], best)
+
+
+def test_what_is_drawn_to_rescue_is_wider_and_by_turns_anew_and_about_the_best() -> None:
+    changes: dict[str, Any] = {"samples": 40, "rounds": 1, "rescue": 2, "wider": 4.0}
+    planner = planner_for(2, states_of(true_motion()[0]), **changes)
+    tried = sinking_tries(planner, [[1.0, 1.0]])
+    planner._look_ahead(SimpleNamespace(state_dict=dict))  # type: ignore[arg-type]
+    usual, anew, about = tried
+    spread = [float(ways[2:].square().mean().sqrt()) for ways in (usual, anew)]
+    assert 3.0 < spread[1] / spread[0] < 5.0
+    # The mean of the four best is the same for all that is drawn about it; that is half as wide as what is drawn anew.
+    ways, score = torch.cat([usual, anew]), torch.full((80, 2), -100.0)
+    score[39], score[79] = 0.0, 1.0
+    fixed = planner._refined(ways, score)[:15]
+    torch.testing.assert_close(about[:6], fixed[:6])
+    size = float((about[15:] - about[15:].mean(0)).square().mean().sqrt())
+    assert 0.35 < size / spread[1] < 0.65
+
+
+def test_the_head_is_as_low_as_a_plain_simulation_ends() -> None:
+    followed, base = true_motion()[0], leaning(make_env(2))
+    planner = planner_for(2, states_of(followed))
+    ways = planner._additions(planner.settings.samples, 3.0)
+    low = planner._tried(base.state_dict(), ways)[2]
+    env = frozen(make_env(2, followed))
+    env.reset()
+    here = base_of(env)
+    here.load_state_dict(base.state_dict())
+    observation = env.transform(here.observe())
+    for step in range(planner.settings.horizon):
+        observation = actor()(observation)
+        observation["action"] = observation["action"] + ways[5, :, step]
+        observation = env.step(observation)["next"].exclude("reward", "action")
+    head, frame = humanoid().head, observation["frame"].squeeze(-1)
+    expected = (followed["xpos"][frame, head, 2] - here.body_state()["xpos"][:, head, 2]).clamp(min=0)
+    torch.testing.assert_close(low[5], expected.float(), rtol=0, atol=1e-5)
+    assert low.max() > 0.01
+    env.close()
