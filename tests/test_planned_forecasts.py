@@ -26,7 +26,8 @@ from egopose.evaluation.forecasting import ForecastWindow
 from egopose.forecast_evaluation import ForecastSettings, forecast_windows_of
 from egopose.inference.estimator import prepare_for_test
 from egopose.inference.forecaster import forecast
-from egopose.inference.planning import Planner, PlannerSettings, followed_futures
+from egopose.inference.planner_settings import PlannerSettings
+from egopose.inference.planning import Planner, followed_futures
 from egopose.material import Material
 from egopose.training.predictions import torch_threads
 

@@ -28,7 +28,8 @@ from egopose.estimate import allowed_planner
 from egopose.evaluation.agents import estimate_and_judge
 from egopose.inference.estimator import Estimate, estimate_takes
 from egopose.inference.failsafe import FailSafe, FailSafeSettings
-from egopose.inference.planning import Planner, PlannerSettings, planner_settings
+from egopose.inference.planner_settings import PlannerSettings, planner_settings
+from egopose.inference.planning import Planner
 
 FRAMES = 60
 PIECES = (Piece(0, 0, FRAMES), Piece(1, 0, FRAMES))

@@ -30,7 +30,7 @@ from egopose.evaluation.agents import evaluate_agent  # noqa: E402
 from egopose.evaluation.protocols import ContactSettings, fragment_names, raw_figures  # noqa: E402
 from egopose.evaluation.tables import write_json  # noqa: E402
 from egopose.inference.failsafe import FailSafeSettings  # noqa: E402
-from egopose.inference.planning import planner_settings  # noqa: E402
+from egopose.inference.planner_settings import planner_settings  # noqa: E402
 from egopose.material import run_material  # noqa: E402
 from egopose.models.baselines.path_pose import PathPose  # noqa: E402
 from egopose.pipeline import load_agent  # noqa: E402

@@ -28,7 +28,7 @@ from egopose.evaluation.agents import FragmentResult, evaluate_agent  # noqa: E4
 from egopose.evaluation.protocols import ContactSettings  # noqa: E402
 from egopose.files import write_text_whole  # noqa: E402
 from egopose.inference.failsafe import FailSafeSettings  # noqa: E402
-from egopose.inference.planning import planner_settings  # noqa: E402
+from egopose.inference.planner_settings import planner_settings  # noqa: E402
 from egopose.pipeline import Agent, load_agent  # noqa: E402
 from egopose.untrusted import read_yaml  # noqa: E402
 

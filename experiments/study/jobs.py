@@ -26,7 +26,7 @@ from egopose.forecast_contexts import past_states
 from egopose.forecast_evaluation import ForecastSettings, forecast_windows_of, windows_of
 from egopose.inference.context_states import context_states
 from egopose.inference.failsafe import FailSafeSettings
-from egopose.inference.planning import planner_settings
+from egopose.inference.planner_settings import planner_settings
 from egopose.material import Material, absolute_paths, load_material, run_material
 from egopose.models.baselines.path_pose import PathPose
 from egopose.models.baselines.recurrent import RecurrentForecaster

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
     from egopose.humanoid.model import HumanoidModel
     from egopose.inference.causal import CausalRegression
-    from egopose.inference.planning import PlannerSettings
+    from egopose.inference.planner_settings import PlannerSettings
     from egopose.material import Material
     from egopose.models.regressor import StateRegressor
     from egopose.motion.motion import Motion
@@ -187,7 +187,8 @@ def run_estimate(config: Mapping[str, Any], agent: Agent, pose_motion: Motion, v
     from egopose.evaluation.tables import write_columns_csv
     from egopose.inference.estimator import estimate_takes
     from egopose.inference.failsafe import FailSafe, FailSafeSettings
-    from egopose.inference.planning import Planner, planned_kappa
+    from egopose.inference.planner_settings import planned_kappa
+    from egopose.inference.planning import Planner
     from egopose.vision.lens import Camera
 
     failsafe = from_mapping(FailSafeSettings, config["failsafe"], "conf/estimate.yaml: failsafe")
@@ -227,7 +228,7 @@ def allowed_planner(config: Mapping[str, Any]) -> PlannerSettings | None:
     Raises:
         InputError: a setting is missing or wrong.
     """
-    from egopose.inference.planning import planner_settings
+    from egopose.inference.planner_settings import planner_settings
 
     settings = planner_settings(config.get("planner"))
     return None if config["causal"] else settings

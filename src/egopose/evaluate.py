@@ -71,7 +71,7 @@ def run_evaluation(
     from egopose.evaluation.agents import evaluate_agent, failsafe_figures, survival_figures
     from egopose.evaluation.protocols import ContactSettings, fragment_names
     from egopose.inference.failsafe import FailSafeSettings
-    from egopose.inference.planning import planned_kappa, planner_settings
+    from egopose.inference.planner_settings import planned_kappa, planner_settings
     from egopose.pipeline import build_networks
 
     source = "conf/evaluate.yaml"

@@ -26,7 +26,8 @@ from egopose.forecast_contexts import SOURCES, past_states
 from egopose.inference.bands import Bands, fit_scale, quantile_bands
 from egopose.inference.failsafe import FailSafeSettings
 from egopose.inference.forecaster import Forecasts, forecast
-from egopose.inference.planning import Planner, PlannerSettings, followed_futures, planner_settings
+from egopose.inference.planner_settings import PlannerSettings, planner_settings
+from egopose.inference.planning import Planner, followed_futures
 from egopose.material import Material
 from egopose.models.baselines.recurrent import RecurrentForecaster
 from egopose.motion.io import write_motion

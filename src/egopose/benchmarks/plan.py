@@ -31,7 +31,8 @@ def run(overrides: Sequence[str], rounds: int) -> dict[str, Any]:
     from egopose.envs.benchmark import RawReplay, StepRecorder
     from egopose.envs.mdp.observations import humanoid_state
     from egopose.inference.estimator import prepare_for_test
-    from egopose.inference.planning import Planner, planner_settings
+    from egopose.inference.planner_settings import planner_settings
+    from egopose.inference.planning import Planner
 
     ours = [word for word in overrides if word.startswith("planner.")]
     config = pipeline.compose_config("train", ["sim=fast", *(word for word in overrides if word not in ours)])

@@ -17,7 +17,8 @@ from egopose.evaluation.triggers import TakeTriggers, as_dict, take_triggers
 from egopose.inference.estimator import Controller, Estimate, estimate_takes
 from egopose.inference.failsafe import FailSafe, FailSafeSettings
 from egopose.inference.forks import Forks
-from egopose.inference.planning import Planner, PlannerSettings, planned_kappa
+from egopose.inference.planner_settings import PlannerSettings, planned_kappa
+from egopose.inference.planning import Planner
 from egopose.models.pose_regression import pose_regression
 from egopose.motion import rotations as rot
 from egopose.motion.motion import Motion

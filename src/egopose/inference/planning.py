@@ -11,10 +11,8 @@ plays no part.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
 from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import torch
@@ -28,6 +26,7 @@ from egopose.envs.futures import Futures
 from egopose.envs.mdp.rewards import Reward, build_reward
 from egopose.envs.transformed import Entries, parts_of, run_parts
 from egopose.errors import InputError
+from egopose.inference.planner_settings import PlannerSettings
 from egopose.models.pose_regression import state_to_qpos
 
 _EPISODE = ("take", "start", "stop", "frame")  # with one number for each body
@@ -66,70 +65,6 @@ def followed_futures(futures: Futures, starts: Tensor) -> tuple[Tensor, Rows]:
         return number[start] * len(steps) + step.clamp(max=futures.horizon)
 
     return states, row
-
-
-@dataclass(frozen=True)
-class PlannerSettings:
-    """``conf/planner``; each file gives every value and its source.
-
-    Args:
-        samples: ways tried at a time.
-        rounds: of so many ways each, the later ones between and about the best of those before.
-        rescue: further rounds at most, as long as some body's best way ends with its head lower by ``sinking`` (m) than
-            what is followed has it; by turns drawn anew and about the best, the deviation ``wider`` times as large.
-        horizon: frames they are simulated for.
-        every: frames between plans.
-        knot: frames between the knots of an addition, which is linear in between.
-        deviation: rad, of the largest additions at their knots; others are down to a tenth of it.
-        joints: only hinges whose name contains one of these are added to.
-        acceleration: reward lost per unit (m/s^2, rad/s^2) of the velocities' mean absolute change.
-        head: reward lost per metre by which the head is lower than what is followed has it.
-        lost: m; a body whose head is lower than that by more is worth nothing to the fail-safe, whatever its plan.
-        margin: reward by which a way must do better than the plan so far to be taken, and either than no addition.
-        near: reward; of ways that are worse than the best by no more, the one that changes least of the plan so far is
-            taken.
-        discount: of a frame.
-        kappa: of the fail-safe, where it has none of its own, for the values of plans.
-        reward: as a file of ``conf/reward`` in the heading frame: how near the body is to what it follows.
-        seed: of the additions.
-    """
-
-    samples: int
-    rounds: int
-    rescue: int
-    sinking: float
-    wider: float
-    horizon: int
-    every: int
-    knot: int
-    deviation: float
-    joints: tuple[str, ...]
-    acceleration: float
-    head: float
-    lost: float
-    margin: float
-    near: float
-    discount: float
-    kappa: float
-    reward: Any
-    seed: int
-
-    def __post_init__(self) -> None:
-        def check(ok: bool, name: str, cause: str) -> None:
-            if not ok:
-                raise InputError("planner", name, cause)
-
-        check(self.samples >= 3, "samples", "must be at least 3: without an addition, the plan so far, and a new one")
-        check(self.rounds >= 1 and self.rescue >= 0, "rounds", "must be at least 1, and rescue not negative")
-        check(0 < self.every <= self.horizon, "every", "must lie between 1 and the horizon")
-        check(self.knot > 0, "knot", "must be positive")
-        least = min(self.deviation, self.lost, self.sinking, self.wider)
-        check(least > 0, "deviation", "must be positive, as must lost, sinking and wider")
-        least = min(self.acceleration, self.head, self.margin, self.near)
-        check(least >= 0, "acceleration", "must not be negative, nor head, margin or near")
-        check(0 < self.discount <= 1, "discount", "must lie in (0, 1]")
-        kind = self.reward.get("kind") if isinstance(self.reward, Mapping) else None
-        check(kind == "heading_frame", "reward", "must be one in the heading frame")
 
 
 class Planner:
@@ -326,22 +261,3 @@ class Planner:
     def close(self) -> None:
         """Stop the copies' physics."""
         self._env.close()
-
-
-def planned_kappa(settings: PlannerSettings | None) -> float | None:
-    """The fail-safe's kappa for a planner's values; None without a planner."""
-    return None if settings is None else settings.kappa
-
-
-def planner_settings(values: Mapping[str, Any] | None) -> PlannerSettings | None:
-    """Settings of a resolved ``conf/planner``; None for its file ``none``, or where there is none.
-
-    Raises:
-        InputError: a value is missing, unknown or wrong.
-    """
-    from egopose.config import from_mapping
-
-    if not values:
-        return None
-    joints: Sequence[str] = values.get("joints") or ()
-    return from_mapping(PlannerSettings, {**values, "joints": tuple(joints)}, "conf/planner")
