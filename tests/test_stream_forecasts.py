@@ -45,6 +45,7 @@ from egopose.stream import (
     stream,
 )
 from egopose.training.checkpoint import ComponentState, RunCheckpoint, metadata_of
+from egopose.training.continued_forecast import blank_continued_forecaster
 from egopose.training.kernel_forecast import blank_kernel_forecaster
 from egopose.training.motion_forecast import ForecasterSettings, build_forecaster
 from egopose.training.predictions import torch_threads
@@ -310,6 +311,7 @@ def following_run(trained: Trained, tmp_path_factory: pytest.TempPathFactory) ->
     sizes = {"centres": torch.tensor(4)}
     kept: dict[str, Any] = {"members": torch.nn.ModuleList(parts), "kernel": blank}
     kept["sizes"] = ComponentState(lambda: sizes, lambda _: None)
+    kept["continued"] = blank_continued_forecaster(settings, torch.zeros(pose), torch.ones(pose), 30.0)
     RunCheckpoint(kept).save(folder / "forecaster", metadata=metadata_of("motion forecaster", pose, 0, 0, 0.0))
     material = still_futures(config, still_frames(trained.humanoid, trained.regressor, trained.made_with, 70))
     made = pipeline.build_run(config, folder, material)
