@@ -62,13 +62,12 @@ class PlannerSettings:
                 raise InputError("planner", name, cause)
 
         check(self.samples >= 3, "samples", "must be at least 3: without an addition, the plan so far, and a new one")
-        check(self.rounds >= 1 and self.rescue >= 0, "rounds", "must be at least 1, and rescue not negative")
+        check(self.rounds >= 1, "rounds", "must be at least 1")
         check(0 < self.every <= self.horizon, "every", "must lie between 1 and the horizon")
-        check(self.knot > 0, "knot", "must be positive")
-        least = min(self.deviation, self.lost, self.sinking, self.wider)
-        check(least > 0, "deviation", "must be positive, as must lost, sinking and wider")
-        least = min(self.acceleration, self.head, self.margin, self.near)
-        check(least >= 0, "acceleration", "must not be negative, nor head, margin or near")
+        for name in ("knot", "deviation", "lost", "sinking", "wider"):
+            check(getattr(self, name) > 0, name, "must be positive")
+        for name in ("rescue", "acceleration", "head", "margin", "near"):
+            check(getattr(self, name) >= 0, name, "must not be negative")
         check(0 < self.discount <= 1, "discount", "must lie in (0, 1]")
         kind = self.reward.get("kind") if isinstance(self.reward, Mapping) else None
         check(kind == "heading_frame", "reward", "must be one in the heading frame")
