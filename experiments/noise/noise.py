@@ -3,8 +3,9 @@
     python experiments/noise/noise.py RUN [RUN ...] [--corruptions jitter drift] [--workers 1] [--results DIR]
 
 A run is a directory of `egopose train` (ours, VGAIL) or of `egopose baseline baseline=path_pose`; each policy's run
-brings its PoseReg along. Corruptions are those of conf/corruption; the wearer's videos are rendered anew for each, once
-a store. What has been judged is not judged again. To train on corrupted video: `egopose train ... corruption=jitter`.
+brings the regressor along that it follows: VGAIL's is PoseReg, ours may be the blended one. Corruptions are those of
+conf/corruption; the wearer's videos are rendered anew for each, once a store. What has been judged is not judged again.
+To train on corrupted video: `egopose train ... corruption=jitter`.
 """
 
 from __future__ import annotations
@@ -57,6 +58,11 @@ def method_of(config: Mapping[str, Any]) -> str:
     return "vgail" if "discriminator" in config["algo"] else "ours"
 
 
+def regressor_of(config: Mapping[str, Any]) -> str:
+    """What the state regressor of a policy's run is called: PoseReg is the network on flow alone."""
+    return "posereg" if config["regressor"].get("kernel") is None else "blended"
+
+
 def planner_of(config: Mapping[str, Any]) -> Any:
     """How a run's body looks ahead, as in `egopose evaluate`; VGAIL's torques cannot be planned for."""
     return compose_config("evaluate", ["checkpoint=none"])["planner"] if method_of(config) == "ours" else None
@@ -78,7 +84,7 @@ def judge(run: Path, config: Mapping[str, Any], corruption: Mapping[str, Any]) -
     found = evaluate_agent(agent, fragments, labels, "test", failsafe, contact, threads, planner=planner)
     return {
         method_of(config): raw_figures([one.scores for one in found]),
-        "posereg": raw_figures([one.pose_regression_scores for one in found]),
+        regressor_of(agent.config): raw_figures([one.pose_regression_scores for one in found]),
     }
 
 
@@ -110,7 +116,7 @@ def judge_all(runs: Sequence[Path], corruptions: Sequence[str], results: Path, w
         if workers is not None:
             config["vision"]["workers"] = workers
         method, trained = method_of(config), _name_of(config.get("corruption"))
-        methods = [method] if method == "pathpose" else [method, "posereg"]
+        methods = [method] if method == "pathpose" else [method, regressor_of(config)]
         fold = _fold(config["data"]["split"])
         planner = planner_of(config)
         for name in corruptions:

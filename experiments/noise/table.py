@@ -34,7 +34,13 @@ CORRUPTIONS = {
     "dropped": "dropped frames",
     "all": "all at once",
 }
-METHODS = {"ours": "ours", "vgail": "VGAIL", "pathpose": "PathPose", "posereg": "PoseReg"}
+METHODS = {
+    "ours": "ours",
+    "blended": "the regressor ours follows",
+    "vgail": "VGAIL",
+    "pathpose": "PathPose",
+    "posereg": "PoseReg",
+}
 METRICS = {
     "E_pose": "E_pose (rad)",
     "E_vel": "E_vel",

@@ -69,6 +69,13 @@ class WearerCamera:
         return np.array([self.yaw, self.pitch_down, self.roll]) + noise
 
 
+def worn_camera(take_seed: int, count: int, fps: float, config: CameraConfig) -> tuple[WearerCamera, Array]:
+    """A take's camera, and yaw, pitch down, roll (rad) of each of its ``count`` frames ``[count, 3]``."""
+    rng = np.random.default_rng([take_seed, 2])
+    worn = WearerCamera.draw(rng, config)
+    return worn, worn.angles(rng, count, fps)
+
+
 class SceneRenderer:
     """Renders poses of a compiled model; a context manager that gives its OpenGL back.
 
@@ -236,9 +243,8 @@ def wearer_frames(
     model = furnished_model(model_xml, draw_room(room_seed, qpos[:, :2], float(qpos[:, 2].max()) + _REACH, room), room)
     if qpos.shape[1] != model.nq:
         raise ValueError(f"qpos has {qpos.shape[1]} coordinates, the model {model.nq}")
-    rng = np.random.default_rng([take_seed, 2])
-    worn = WearerCamera.draw(rng, camera)
-    angles, shown = worn.angles(rng, len(qpos), fps), np.arange(len(qpos))
+    worn, angles = worn_camera(take_seed, len(qpos), fps, camera)
+    shown = np.arange(len(qpos))
     if corruption is not None:
         wrong = corruption.generator(take_seed)
         angles, shown = angles + corruption.angles(wrong, len(qpos), fps), corruption.shown(wrong, len(qpos))

@@ -101,10 +101,14 @@ def is_rendered(job: RenderJob, config: RenderConfig) -> bool:
         return False
 
 
+def take_seed(name: str) -> int:
+    """What decides how the camera of the take of that name is worn and shakes."""
+    return int.from_bytes(hashlib.sha256(name.encode()).digest()[:4], "big")
+
+
 def render_take(job: RenderJob, config: RenderConfig) -> int:
     """Render one take and write beside the MP4 what it shows; returns the number of frames."""
     seed = room_seed(job.name, job.split, config.room)
-    take_seed = int.from_bytes(hashlib.sha256(job.name.encode()).digest()[:4], "big")
     if _record(job.path).exists():
         # Until the new video is there the old record must not vouch for the old one.
         _record(job.path).unlink()
@@ -113,7 +117,7 @@ def render_take(job: RenderJob, config: RenderConfig) -> int:
         job.qpos,
         job.path,
         room_seed=seed,
-        take_seed=take_seed,
+        take_seed=take_seed(job.name),
         room=config.room,
         camera=config.camera,
         size=config.size,
