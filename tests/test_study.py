@@ -51,12 +51,13 @@ def write_raw(job: Any, results: Path, **values: Any) -> None:
     path.write_text(json.dumps({"fingerprint": job.fingerprint, **values}))
 
 
-def test_every_job_of_the_study_file_composes() -> None:
+@pytest.mark.parametrize(("name", "least"), [("study.yaml", 50), ("large.yaml", 5)])
+def test_every_job_of_the_study_files_composes(name: str, least: int) -> None:
     from study import list_jobs
 
-    study = yaml.safe_load((STUDY / "study.yaml").read_text())
+    study = yaml.safe_load((STUDY / name).read_text())
     jobs = list_jobs(study)
-    assert len(jobs) > 50
+    assert len(jobs) >= least
     own = {row["table"]: row["budget"] for row in study["tables"] if "budget" in row}
     seen: set[str] = set()
     for job in jobs:
@@ -187,6 +188,22 @@ def test_ratios_are_those_worked_out_by_hand(tmp_path: Path) -> None:
     shown = (tmp_path / "table1_estimation" / "README.md").read_text()
     assert "| PoseReg | 6.000 [" in shown
     assert "0.667 [" in shown
+
+
+def test_data_that_the_paper_has_not_is_compared_without_its_ratios(
+    tmp_path: Path, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import tables
+
+    for method, error in (("ours", 1.0), ("posereg", 4.0)):
+        raw(tmp_path, method, "a", 0, {key: [error] for key in ("E_pose", "E_vel", "A_accl")}, protocol="large")
+    monkeypatch.setattr(sys, "argv", ["tables.py", "--results", str(tmp_path)])
+    tables.main()
+    assert "large/e_pose/posereg             0.250 [0.250, 0.250]\n" in capsys.readouterr().out
+    found = json.loads((tmp_path / "ratios.json").read_text())["large/e_pose/posereg"]
+    assert (found["ratio"], found["paper"]) == (0.25, None)
+    shown = (tmp_path / "table1_estimation" / "README.md").read_text()
+    assert "| large/e_pose/posereg | 0.250 [0.250, 0.250] |  |" in shown
 
 
 def test_results_of_other_takes_or_smaller_budgets_are_not_compared(tmp_path: Path, capsys) -> None:

@@ -385,7 +385,8 @@ def main() -> None:
         print(f"error: {error}", file=sys.stderr)
         raise SystemExit(2) from None
     for name, found in measured.items():
-        print(f"{name:32s} {found['ratio']:.3f} [{found['low']:.3f}, {found['high']:.3f}]  paper {found['paper']:.3f}")
+        paper = "" if found["paper"] is None else f"  paper {found['paper']:.3f}"
+        print(f"{name:32s} {found['ratio']:.3f} [{found['low']:.3f}, {found['high']:.3f}]{paper}")
 
 
 if __name__ == "__main__":
