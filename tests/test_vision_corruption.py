@@ -185,3 +185,12 @@ def test_only_what_estimates_is_judged() -> None:
     for name, words in (("baseline", ["baseline=erd"]), ("train", ["experiment=forecasting"])):
         with pytest.raises(InputError, match=r"estimates nothing|forecasts"):
             noise.method_of(compose_config(name, words))
+
+
+@pytest.mark.parametrize(
+    ("words", "called"),
+    [([], "posereg"), (["regressor=cross_fitted"], "posereg"), (["regressor=blended"], "blended")],
+)
+def test_only_the_network_on_flow_alone_is_called_posereg(words: list[str], called: str, table: ModuleType) -> None:
+    assert _script("noise").regressor_of(compose_config("train", words)) == called
+    assert called in table.METHODS
