@@ -16,6 +16,7 @@ from torch import Tensor
 from egopose.errors import InputError
 from egopose.models.mirror import StateMirror
 from egopose.models.motion_forecast import ContinuedForecaster, spline_basis, spline_times
+from egopose.runtime import torch_threads
 from egopose.training import continued_forecast
 from egopose.training.continued_forecast import (
     blank_continued_forecaster,
@@ -23,7 +24,6 @@ from egopose.training.continued_forecast import (
     fit_continued_forecaster,
 )
 from egopose.training.fragments import Span
-from egopose.training.predictions import torch_threads
 from egopose.training.recurrent_baselines import RecurrentLearner
 
 HORIZON = 12

@@ -33,6 +33,7 @@ from egopose.models.mirror import StateMirror, state_mirror
 from egopose.models.motion_forecast import KernelForecaster, spline_basis, spline_times
 from egopose.motion_forecasts import FOLDER, PARTS, ForecastCurves, Members, with_futures
 from egopose.regression import load_regressor, regressor_name, regressor_tables, training_contexts
+from egopose.runtime import torch_threads
 from egopose.ship import _copy_components
 from egopose.training import blending
 from egopose.training import past_contexts as past
@@ -43,7 +44,7 @@ from egopose.training.fragments import Span, cross_fit_blocks
 from egopose.training.kernel_forecast import Contexts, blank_kernel_forecaster, fit_kernel_forecaster
 from egopose.training.motion_forecast import ForecastLearner, build_forecaster, cross_fit_starts
 from egopose.training.past_contexts import past_contexts
-from egopose.training.predictions import predict_takes, torch_threads
+from egopose.training.predictions import predict_takes
 
 HERE: dict[str, Any] = {
     "bins": [2, 3], "axes": 1000, "whitening": 0.5, "ridge": 0.1, "length": 1.0, "centres": 1000, "share": 0.3,

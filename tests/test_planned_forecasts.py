@@ -29,7 +29,7 @@ from egopose.inference.forecaster import forecast
 from egopose.inference.planner_settings import PlannerSettings
 from egopose.inference.planning import Planner, followed_futures
 from egopose.material import Material
-from egopose.training.predictions import torch_threads
+from egopose.runtime import torch_threads
 
 WINDOWS = [ForecastWindow(0, 0, 5, 12), ForecastWindow(0, 9, 5, 12), ForecastWindow(0, 4, 5, 12)]
 TEST = {"whole_fragments": True, "falls_end": False}

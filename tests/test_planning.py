@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import cache
 from types import SimpleNamespace
 from typing import Any
@@ -30,6 +31,7 @@ from egopose.inference.estimator import Estimate, estimate_takes
 from egopose.inference.failsafe import FailSafe, FailSafeSettings
 from egopose.inference.planner_settings import PlannerSettings, planner_settings
 from egopose.inference.planning import Planner
+from egopose.runtime import prefer_quick_products
 
 FRAMES = 60
 PIECES = (Piece(0, 0, FRAMES), Piece(1, 0, FRAMES))
@@ -524,10 +526,11 @@ def test_what_cannot_be_planned_for_is_refused() -> None:
         Planner(env, actor(), critic(), states, settings(**SMALL))
 
 
-def estimated_by(planner: PlannerSettings | None) -> list[Estimate]:
-    """What an evaluation makes of both takes."""
+def estimated_by(planner: PlannerSettings | None, made: Callable[[], None] = lambda: None) -> list[Estimate]:
+    """What an evaluation makes of both takes; ``made`` is called when it makes an environment."""
 
     def env_of(split: str, *, worlds: int, threads: int, fragments: Any, **options: bool) -> TransformedEnv:
+        made()
         assert options == {"whole_fragments": True, "falls_end": False}
         assert list(fragments) == list(PIECES)
         return frozen(make_env(worlds, threads=threads))
@@ -554,6 +557,20 @@ def test_an_evaluation_plans_only_where_it_is_told_to() -> None:
         for one, two in zip(estimated_by(planned), by_hand, strict=True):
             np.testing.assert_array_equal(one.qpos, two.qpos)
             np.testing.assert_array_equal(one.value, two.value)
+
+
+@pytest.mark.parametrize("before", [1, 2])
+def test_an_evaluation_has_the_same_threads_whatever_the_process_did_before(before: int) -> None:
+    # Last digits are other ones with other threads or another library of products, and torques that fall tell them.
+    found: list[tuple[int, str]] = []
+    usual, setting = torch.get_num_threads(), getattr(torch.backends.mkldnn, "matmul")  # noqa: B009
+    torch.set_num_threads(before)
+    try:
+        estimated_by(None, lambda: found.append((torch.get_num_threads(), setting.fp32_precision)))
+        assert torch.get_num_threads() == before
+    finally:
+        torch.set_num_threads(usual)
+    assert found == [(1, "bf16" if prefer_quick_products() else "none")]
 
 
 def test_estimates_plan_unless_they_are_causal_or_told_not_to() -> None:

@@ -25,8 +25,8 @@ from egopose.inference.failsafe import FailSafe, FailSafeSettings
 from egopose.inference.stream.body import LiveBody, LivePose
 from egopose.motion.io import read_motion
 from egopose.pipeline import build_env
+from egopose.runtime import torch_threads
 from egopose.stream import Trained, build_loop, source_settings, stream
-from egopose.training.predictions import torch_threads
 from egopose.vision.features import extract_flow
 
 FRAMES, LOOKAHEAD = 40, 10

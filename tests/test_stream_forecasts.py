@@ -34,6 +34,7 @@ from egopose.inference.stream.outputs import open_outputs
 from egopose.models.recurrent import PastContext
 from egopose.motion.io.native import skeleton_from_json
 from egopose.motion_forecasts import still_futures
+from egopose.runtime import torch_threads
 from egopose.stream import (
     Forecaster,
     Trained,
@@ -48,7 +49,6 @@ from egopose.training.checkpoint import ComponentState, RunCheckpoint, metadata_
 from egopose.training.continued_forecast import blank_continued_forecaster
 from egopose.training.kernel_forecast import blank_kernel_forecaster
 from egopose.training.motion_forecast import ForecasterSettings, build_forecaster
-from egopose.training.predictions import torch_threads
 
 CONTEXT = 30
 LATENCY = ("forecast_encoder", "forecast_rollout", "forecast_output")

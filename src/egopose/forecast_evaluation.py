@@ -34,6 +34,7 @@ from egopose.motion.io import write_motion
 from egopose.motion.motion import Motion
 from egopose.motion.rotations import Array
 from egopose.motion_forecasts import begin_forecasts
+from egopose.runtime import torch_threads
 
 if TYPE_CHECKING:
     from egopose.pipeline import Agent
@@ -236,7 +237,8 @@ def forecast_windows_of(
             copies = agent.make_env(worlds=len(part) * planner.samples, fragments=part, **options)
             followed, row = followed_futures(futures, now)
             ahead = Planner(copies, agent.actor, agent.critic, followed, planner, row)
-        parts.append(forecast(env, agent.actor, qpos, qvel, samples, horizon, seed, settings.noise_time, ahead))
+        with torch_threads(1):
+            parts.append(forecast(env, agent.actor, qpos, qvel, samples, horizon, seed, settings.noise_time, ahead))
         env.close()
         if ahead is not None:
             ahead.close()

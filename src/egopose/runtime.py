@@ -8,6 +8,8 @@ import multiprocessing
 import os
 import threading
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from functools import cache
 from typing import Any
 
@@ -70,6 +72,23 @@ def prefer_quick_products() -> bool:
         setting.fp32_precision = before
         return False
     return True
+
+
+@contextmanager
+def torch_threads(count: int) -> Iterator[None]:
+    """``count`` threads for torch inside, what it was before after; quick products from here on.
+
+    Both decide the last digits, and a body that falls tells them: the same figures again need the same of both.
+    """
+    import torch
+
+    prefer_quick_products()
+    before = torch.get_num_threads()
+    torch.set_num_threads(count)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
 
 
 def _keeps_single_precision(rows: int, inner: int, columns: int) -> bool:

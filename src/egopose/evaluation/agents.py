@@ -23,6 +23,7 @@ from egopose.models.pose_regression import pose_regression
 from egopose.motion import rotations as rot
 from egopose.motion.motion import Motion
 from egopose.motion.rotations import Array
+from egopose.runtime import torch_threads
 
 if TYPE_CHECKING:
     from egopose.pipeline import Agent
@@ -114,7 +115,8 @@ def estimate_and_judge(
     triggers: dict[int, TakeTriggers | None] = {}
     for group in groups:
         chosen = [fragments[i] for i in group]
-        found, judged = _together(agent, chosen, split, failsafe, threads, window, planner)
+        with torch_threads(1):
+            found, judged = _together(agent, chosen, split, failsafe, threads, window, planner)
         estimates |= dict(zip(group, found, strict=True))
         triggers |= dict(zip(group, judged, strict=True))
     return [estimates[i] for i in range(worlds)], [triggers[i] for i in range(worlds)]

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from egopose.config import from_mapping
 from egopose.errors import InputError
-from egopose.training.predictions import torch_threads
+from egopose.runtime import torch_threads
 
 State = dict[str, Tensor]
 

@@ -20,8 +20,9 @@ from egopose.models.blended import MeanOfKernels, TimeWindows, blended_regressor
 from egopose.models.kernel_regression import KernelRegression, fit_kernel_regression
 from egopose.models.mirror import StateMirror, state_mirror
 from egopose.models.regressor import StateRegressor
+from egopose.runtime import torch_threads
 from egopose.training.fragments import Span, without_block
-from egopose.training.predictions import Flow, take_frames, torch_threads
+from egopose.training.predictions import Flow, take_frames
 from egopose.training.regressor_settings import RegressorSettings
 from egopose.vision.encoders import FLOW_CHANNELS
 from egopose.vision.limbs import load_finder

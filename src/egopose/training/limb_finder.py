@@ -21,8 +21,8 @@ from egopose.config import from_mapping
 from egopose.errors import InputError
 from egopose.models.mirror import StateMirror, joint_mirror
 from egopose.motion.skeleton import Skeleton
+from egopose.runtime import torch_threads
 from egopose.training.checkpoint import ComponentState, RunCheckpoint, metadata_of, read_json
-from egopose.training.predictions import torch_threads
 from egopose.vision.flow import FlowConfig
 from egopose.vision.limb_pictures import BODIES, posture_names
 from egopose.vision.limbs import LIMBS, LimbFinder

@@ -10,9 +10,10 @@ from torch import Tensor
 from egopose.humanoid.model import HumanoidModel
 from egopose.models.blended import MeanOfKernels
 from egopose.models.regressor import StateRegressor
+from egopose.runtime import torch_threads
 from egopose.training.blending import KernelSettings, fit_kernels, importance_of, mirror_image, view_table, windowed
 from egopose.training.fragments import Span, without_block
-from egopose.training.predictions import Flow, torch_threads
+from egopose.training.predictions import Flow
 from egopose.training.regressor_settings import RegressorSettings
 
 _CONTEXTS = 64  # contexts that are regressed together

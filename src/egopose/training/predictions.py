@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -11,7 +10,7 @@ import torch
 from torch import Tensor
 
 from egopose.models.regressor import StateRegressor
-from egopose.runtime import prefer_quick_products
+from egopose.runtime import torch_threads
 from egopose.training.fragments import Span
 from egopose.training.regressor_settings import RegressorSettings
 
@@ -23,18 +22,6 @@ def take_frames(flow: Flow, frames: np.ndarray) -> Tensor:
     """Rows ``frames [N]`` as float32, a copy."""
     rows = flow[torch.as_tensor(frames)] if isinstance(flow, Tensor) else torch.from_numpy(np.asarray(flow[frames]))
     return rows.to(torch.float32, copy=True)
-
-
-@contextmanager
-def torch_threads(count: int) -> Iterator[None]:
-    """``count`` threads for torch inside, what it was before after; quick products from here on."""
-    prefer_quick_products()
-    before = torch.get_num_threads()
-    torch.set_num_threads(count)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
 
 
 @torch.no_grad()

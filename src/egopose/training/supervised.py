@@ -18,8 +18,9 @@ from torch import Tensor, nn
 from egopose.errors import InputError
 from egopose.models.mirror import StateMirror
 from egopose.models.regressor import StateRegressor, state_statistics
+from egopose.runtime import torch_threads
 from egopose.training.fragments import Span, Window, split_validation, training_windows
-from egopose.training.predictions import Flow, predict_span, take_frames, torch_threads
+from egopose.training.predictions import Flow, predict_span, take_frames
 from egopose.training.regressor_settings import RegressorSettings, learning_rate_at
 
 State = dict[str, Tensor]
