@@ -13,6 +13,7 @@ from egopose.runtime import prepare_runtime
 prepare_runtime()
 
 import argparse  # noqa: E402
+from collections.abc import Mapping  # noqa: E402
 from pathlib import Path  # noqa: E402
 from typing import Any  # noqa: E402
 
@@ -45,14 +46,13 @@ from egopose.training.blending import (  # noqa: E402
 )
 from egopose.training.fragments import Span, cross_fit_blocks, without_block  # noqa: E402
 from egopose.vision.limb_pictures import BODIES, posture_in  # noqa: E402
-from egopose.vision.limbs import LimbFinder  # noqa: E402
+from egopose.vision.limbs import LOG_VARIANCE, LimbFinder  # noqa: E402
 from egopose.vision.rendering import WEARER_CAMERA, camera_orientations, worn_camera  # noqa: E402
 from egopose.vision.takes import RenderConfig, take_seed  # noqa: E402
 
 HERE = Path(__file__).resolve().parent
 SUBJECTS = ("2", "5", "7")
 PLACES = 3 * len(BODIES)  # numbers at a posture's begin; the four after it are the camera's
-SURE = -4.0  # the least logarithm of a variance that a finder gives
 HEAD = (
     "# What limits E_pose",
     "",
@@ -97,7 +97,7 @@ def true_postures(config: dict[str, Any], store: TakeStore, humanoid: HumanoidMo
 def with_truth(rows: Tensor, truth: Tensor, known: Tensor) -> Tensor:
     """A finder's rows ``[F, 2 Q]`` with the ``known`` ``[F, Q]`` numbers true, and sure."""
     posture, log_variance = rows.chunk(2, dim=1)
-    return torch.cat([torch.where(known, truth, posture), log_variance.masked_fill(known, SURE)], dim=1)
+    return torch.cat([torch.where(known, truth, posture), log_variance.masked_fill(known, LOG_VARIANCE[0])], dim=1)
 
 
 def told(rows: Tensor, postures: Tensor, inside: Tensor, finder: LimbFinder) -> dict[str, Tensor]:
@@ -123,7 +123,8 @@ def held_out_error(
     states: Tensor,
     fragments: list[Span],
     takes: list[Span],
-    config: dict[str, Any],
+    regressor: Mapping[str, Any],
+    settings: KernelSettings,
     humanoid: HumanoidModel,
 ) -> float:
     """E_pose (rad) of the kernels' mean on cross-fitted blocks of ``fragments``.
@@ -133,22 +134,20 @@ def held_out_error(
         states: ``[F, S]`` the true ones.
         fragments: training frames.
         takes: each a clip by itself.
-        config: resolved, with a blended regressor.
+        regressor: the group of that name, blended.
+        settings: of its kernels.
         humanoid: whose states they are.
     """
-    regressor = config["regressor"]
-    settings = from_mapping(KernelSettings, regressor["kernel"], "conf/regressor kernel")
     mean, std = state_statistics(states[_frames(fragments)], float(regressor["std_floor"]))
     mirrored = state_mirror(humanoid.skeleton).state(states)
     table, image = windowed(views, takes, settings), windowed(mirrored_view(views, settings), takes, settings)
     wanted, wanted_image = (((z - mean) / std).float() for z in (states, mirrored))
-    margin, errors = int(regressor["margin"]), []
+    margin, hands, errors = int(regressor["margin"]), humanoid.hand_dofs.tolist(), []
     for block in cross_fit_blocks(fragments, int(regressor["cross_fit"])):
         others = without_block(fragments, block, margin, margin)
         kernels = fit_kernels(table, wanted, others, settings, importance_of(humanoid, std), (image, wanted_image))
         frames = _frames(block)
         answer = MeanOfKernels(kernels)(table[frames]) * std + mean
-        hands = humanoid.hand_dofs.tolist()
         errors.append(pose_error(_as_qpos(answer, humanoid), _as_qpos(states[frames], humanoid), hands))
     return float(np.concatenate(errors).mean())
 
@@ -169,22 +168,23 @@ def main() -> None:
     parser.add_argument("overrides", nargs="+", help="of the configuration; data.folder=PATH is needed")
     words = ["data=cmu6", "regressor=blended", *parser.parse_args().overrides]
     config = absolute_paths(compose_config("train", words))
-    store, humanoid, finder = prepare(config), humanoid_of(config), load_finder_of(config["regressor"])
+    regressor = config["regressor"]
+    store, humanoid, finder = prepare(config), humanoid_of(config), load_finder_of(regressor)
     assert finder is not None
     takes = [Span(t.offset, t.offset + t.length) for t in store.takes]
-    settings = from_mapping(KernelSettings, config["regressor"]["kernel"], "conf/regressor kernel")
-    seen = seen_in_store(config, config["regressor"], store, flow_name(config))
-    views = view_table(seen, takes, settings, int(config["regressor"]["encode_batch"]))
-    flow, rows = views.split([views.shape[1] - settings.limb_numbers, settings.limb_numbers], dim=1)
+    settings = from_mapping(KernelSettings, regressor["kernel"], "conf/regressor kernel")
+    seen = seen_in_store(config, regressor, store, flow_name(config))
+    table = view_table(seen, takes, settings, int(regressor["encode_batch"]))
+    flow, rows = table.split([table.shape[1] - settings.limb_numbers, settings.limb_numbers], dim=1)
     states = humanoid_state(store.reference)
     lines = []
     for name, given in told(rows, *true_postures(config, store, humanoid), finder).items():
-        cells = []
+        cells, views = [], torch.cat([flow, given], dim=1)
         for subject in SUBJECTS:
             split = {**config["data"]["split"], "subjects": [subject]}
             pieces = split_takes(store.takes, split, "train", supported_only=False)
             fragments = [Span(*span) for span in global_spans(store, pieces)]
-            error = held_out_error(torch.cat([flow, given], dim=1), states, fragments, takes, config, humanoid)
+            error = held_out_error(views, states, fragments, takes, regressor, settings, humanoid)
             cells.append(f"{error:.3f}")
         lines.append(f"| {name} | " + " | ".join(cells) + " |")
         print(lines[-1], flush=True)

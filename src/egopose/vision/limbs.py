@@ -23,8 +23,9 @@ from egopose.vision.video import Frame
 PICTURE, FLOW = 64, 32
 #: Classes of the masks.
 LIMBS = ("right arm", "left arm", "right leg", "left leg", "trunk")
+#: Least and largest logarithm of a variance that a finder gives.
+LOG_VARIANCE = (-4.0, 3.0)
 _FLOW_SCALE = 20.0  # as conf/vision/light.yaml: flow in widths a frame, times this, is of order one
-_LOG_VARIANCE = (-4.0, 3.0)
 _SUMMARY = 256
 _BATCH = 256  # frames a forward pass
 
@@ -101,7 +102,7 @@ class LimbFinder(nn.Module):
         seen = torch.cat([torch.relu(self.first(seen)), flow.to(torch.float32) * _FLOW_SCALE], 1)
         features = self.trunk(self.second(seen))
         posture, log_variance = self.posture(self.summary(features)).chunk(2, 1)
-        return functional.pixel_shuffle(self.mask(features), 2), posture, log_variance.clamp(*_LOG_VARIANCE)
+        return functional.pixel_shuffle(self.mask(features), 2), posture, log_variance.clamp(*LOG_VARIANCE)
 
     def mirrored_rows(self, rows: Tensor) -> Tensor:
         """Rows ``[..., 2 Q]`` (:func:`limb_rows`) of a scene as rows of its mirror image, float32."""
