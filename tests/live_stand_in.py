@@ -12,7 +12,7 @@ from env_stand_in import group
 
 from egopose.benchmarks.stream import untrained_on
 from egopose.data.preparation import humanoid_of
-from egopose.stream import Trained
+from egopose.inference.stream.build import Trained
 from egopose.vision.video import write_video
 
 

@@ -9,7 +9,7 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
-from egopose.config import compose_config
+from egopose.core.config import compose_config
 from egopose.humanoid.config import HumanoidConfig, SimConfig
 from egopose.humanoid.model import HumanoidModel, build_humanoid
 from egopose.motion.io import read_motion

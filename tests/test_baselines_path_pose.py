@@ -11,10 +11,10 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from egopose.errors import InputError
+from egopose.core.errors import InputError
+from egopose.data.spans import Span
 from egopose.models.baselines.path_pose import cluster_poses, coarse_flow, transition_costs, viterbi, windows_around
-from egopose.training.baselines import FitSettings, fit
-from egopose.training.fragments import Span
+from egopose.training.fitting import FitSettings, fit
 from egopose.training.path_pose import PathPoseLearner, PathPoseSettings
 
 SETTINGS = PathPoseSettings(3, 2, 2, 1, (16,), 0.0, 1.0, (1.0, 0.1))

@@ -9,11 +9,11 @@ from typing import Any
 import pytest
 import torch
 
-from egopose.errors import InputError
+from egopose.core.errors import InputError
+from egopose.data.spans import Span
 from egopose.models.baselines.recurrent import RecurrentForecaster, ground_truth_mask, pose_state_size
 from egopose.models.mirror import StateMirror
-from egopose.training.baselines import Fit, FitSettings, fit
-from egopose.training.fragments import Span
+from egopose.training.fitting import Fit, FitSettings, fit
 from egopose.training.recurrent_baselines import RecurrentLearner, RecurrentSettings
 
 FIT = FitSettings(5e-3, 0.0, 1.0, batch=8, validation_share=0.2, check_every=20, patience=100, threads=1)

@@ -14,16 +14,16 @@ from test_material import configuration, fill_flow
 
 from egopose import pipeline
 from egopose.baseline import run_baseline_job
-from egopose.baselines import forecast_qpos, load_baseline, path_pose_motion, regressed_motion
-from egopose.config import compose_config
+from egopose.core.config import compose_config
+from egopose.core.errors import InputError
 from egopose.data import preparation
 from egopose.data.preparation import flow_name, prepare, store_folder
 from egopose.data.store import TakeStore
-from egopose.errors import InputError
-from egopose.evaluation.forecasting import forecast_windows
-from egopose.material import load_material
+from egopose.data.windows import forecast_windows
 from egopose.models.baselines.path_pose import PathPose
 from egopose.models.baselines.recurrent import RecurrentForecaster
+from egopose.pipeline.baselines import forecast_qpos, load_baseline, path_pose_motion, regressed_motion
+from egopose.pipeline.dataset import load_material
 from egopose.training.loop import train
 
 SMALL = {

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from egopose.config import compose_config
+from egopose.core.config import compose_config
 from egopose.data.preparation import humanoid_of
 from egopose.envs.problem import ActionSettings
 from egopose.humanoid.torques import torque_driven

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from egopose import bench
-from egopose.envs.benchmark import RawReplay
+from egopose.benchmarks.raw_replay import RawReplay
 
 SMALL = ["planner.samples=3", "planner.rounds=2", "planner.horizon=4", "planner.every=4", "planner.rescue=0"]
 

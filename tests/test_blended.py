@@ -14,19 +14,19 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from test_material import configuration, fill_flow
 
+from egopose.core.errors import InputError
 from egopose.data.preparation import flow_name, humanoid_of, prepare
+from egopose.data.spans import Span, group_blocks, without_block
 from egopose.data.store import TakeStore
 from egopose.envs.mdp.observations import humanoid_state
-from egopose.errors import InputError
-from egopose.estimate import seen_in
 from egopose.inference.causal import CausalRegression
+from egopose.inference.video_regression import seen_in
 from egopose.models.blended import TimeWindows, blended_regressor, flow_cells
 from egopose.models.kernel_regression import KernelRegression, fit_kernel_regression
 from egopose.models.regressor import StateRegressor
-from egopose.regression import kept_tables, load_regressor, regressor_name, regressor_tables
-from egopose.training import blending
-from egopose.training.blending import KernelSettings, choose_shares, fit_kernels, share_groups, window_table
-from egopose.training.fragments import Span, group_blocks, without_block
+from egopose.pipeline.regressor import kept_tables, load_regressor, regressor_name, regressor_tables
+from egopose.training import blended_regressor as blending
+from egopose.training.blended_regressor import KernelSettings, choose_shares, fit_kernels, share_groups, window_table
 from egopose.vision.encoders import LightFlowEncoder
 
 KERNEL = {

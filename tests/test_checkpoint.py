@@ -16,8 +16,8 @@ from torchrl.render import load_checkpoint
 from torchrl.render.checkpoint import infer_state_dict
 from toy_problem import CONFIG, make_run
 
-from egopose.errors import InputError
-from egopose.training import checkpoint as checkpoints
+from egopose.checkpoint import checkpoint as checkpoints
+from egopose.core.errors import InputError
 from egopose.training.loop import Run, train
 
 

@@ -10,8 +10,8 @@ import sys
 import pytest
 
 from egopose.__main__ import VERBS, main
-from egopose.config import compose_config
-from egopose.errors import InputError
+from egopose.core.config import compose_config
+from egopose.core.errors import InputError
 
 
 def call(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:

@@ -13,17 +13,17 @@ from env_stand_in import group
 from test_motion_forecast import FPS, settings, unmirrored, wave
 from torch import Tensor
 
-from egopose.errors import InputError
+from egopose.core.errors import InputError
+from egopose.core.runtime import torch_threads
+from egopose.data.spans import Span
 from egopose.models.mirror import StateMirror
 from egopose.models.motion_forecast import ContinuedForecaster, spline_basis, spline_times
-from egopose.runtime import torch_threads
 from egopose.training import continued_forecast
 from egopose.training.continued_forecast import (
     blank_continued_forecaster,
     continued_share,
     fit_continued_forecaster,
 )
-from egopose.training.fragments import Span
 from egopose.training.recurrent_baselines import RecurrentLearner
 
 HORIZON = 12

@@ -17,15 +17,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 from mocap import SHORT_CLIPS, short_clips
 
-from egopose.config import compose_config
+from egopose.core.config import compose_config
+from egopose.core.errors import InputError
 from egopose.data import preparation
 from egopose.data.preparation import fingerprint_of, flow_name, global_spans, humanoid_of, prepare, store_folder
 from egopose.data.reference import supported
 from egopose.data.report import store_report
-from egopose.data.sources import find_sources
 from egopose.data.splits import split_takes
 from egopose.data.store import Fragment, TakeInfo, TakeStore, runs_of
-from egopose.errors import InputError
+from egopose.data.take_sources import find_sources
 from egopose.motion.motion import finite_difference
 from egopose.vision.video import VideoWriter
 

@@ -11,17 +11,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from egopose.config import compose_config
+from egopose.core.config import compose_config
+from egopose.core.errors import InputError
 from egopose.data.preparation import prepare
 from egopose.data.store import TakeStore
 from egopose.data.sync import find_offset, head_turning, settings_of, sync_offset, unexplained, video_turning
-from egopose.errors import InputError
 from egopose.motion.io import read_motion, write_motion
 from egopose.motion.motion import Motion
 from egopose.sync import run_sync
+from egopose.vision.camera_rotation import camera_turning
 from egopose.vision.flow import FlowConfig
 from egopose.vision.lens import Camera
-from egopose.vision.turning import camera_turning
 from egopose.vision.video import read_frames, write_video
 
 CLIPS = Path(str(files("egopose") / "assets" / "clips"))

@@ -15,9 +15,7 @@ from torchrl.collectors import Collector
 from torchrl.envs import check_env_specs
 from torchrl.modules import IndependentNormal, ProbabilisticActor
 
-from egopose.envs.transformed import TransformedEgoPoseEnv
-from egopose.envs.transforms import StateNormalizer
-from egopose.training.collectors import (
+from egopose.collection.collectors import (
     CollectorSettings,
     build_collector,
     load_simulation_state,
@@ -25,6 +23,8 @@ from egopose.training.collectors import (
     simulation_state,
     transform_state,
 )
+from egopose.collection.stepping import TransformedEgoPoseEnv
+from egopose.envs.transforms import StateNormalizer
 
 WORLDS, STEPS = 5, 20
 SETTINGS = CollectorSettings("sync", worlds=WORLDS, physics_threads=1, workers=1, threads=1, update_threads=1)

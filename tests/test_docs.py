@@ -12,7 +12,7 @@ import pytest
 from nbclient import NotebookClient
 
 from egopose.__main__ import VERBS
-from egopose.completion import candidates
+from egopose.core.completion import candidates
 
 ROOT = Path(__file__).resolve().parents[1]
 NOTEBOOK = ROOT / "docs" / "notebooks" / "first_look.ipynb"

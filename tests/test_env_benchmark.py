@@ -11,8 +11,8 @@ import torch
 from env_stand_in import environment
 from torchrl.collectors import Collector
 
-from egopose import runtime
-from egopose.envs.benchmark import RawReplay, StepRecorder, compare_with_raw
+from egopose.benchmarks.raw_replay import RawReplay, StepRecorder, compare_with_raw
+from egopose.core import runtime
 
 
 def collector(env) -> Collector:
@@ -65,7 +65,7 @@ def test_the_raw_side_does_the_loops_own_work(monkeypatch) -> None:
 def test_the_runtime_is_prepared_before_torch() -> None:
     """Importing it must not import torch, or the settings come too late."""
     code = (
-        "import sys, os; from egopose.runtime import prepare_runtime; prepare_runtime();"
+        "import sys, os; from egopose.core.runtime import prepare_runtime; prepare_runtime();"
         "assert 'torch' not in sys.modules; assert os.environ['OMP_WAIT_POLICY'] == 'PASSIVE'"
     )
     subprocess.run([sys.executable, "-c", code], check=True)
@@ -74,7 +74,7 @@ def test_the_runtime_is_prepared_before_torch() -> None:
 def test_quick_products_keep_single_precision() -> None:
     """As numpy's double precision says, whichever library multiplies; bfloat16 would be off by 2e-3."""
     code = (
-        "import torch; from egopose.runtime import prefer_quick_products; quick = prefer_quick_products();"
+        "import torch; from egopose.core.runtime import prefer_quick_products; quick = prefer_quick_products();"
         "setting = torch.backends.mkldnn.matmul.fp32_precision; assert (setting == 'bf16') == quick, setting;"
         "a, b = torch.randn(500, 700), torch.randn(700, 300); exact = a.double().numpy() @ b.double().numpy();"
         "error = (((a @ b).numpy() - exact) ** 2).mean() ** 0.5 / exact.std(); assert error < 5e-6, error"

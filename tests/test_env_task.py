@@ -9,8 +9,8 @@ from env_stand_in import PIECES, environment, problem
 from torchrl.envs.libs.dm_control import DMControlWrapper
 from torchrl.envs.utils import check_env_specs
 
+from egopose.envs.dm_control_task import load_environment
 from egopose.envs.starts import WholeFragments
-from egopose.envs.task import load_environment
 
 
 def pair(**kwargs):

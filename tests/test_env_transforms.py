@@ -12,8 +12,8 @@ from tensordict import TensorDict
 from torchrl.envs import Compose, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
+from egopose.collection.stepping import TransformedEgoPoseEnv
 from egopose.envs.problem import TakeTable
-from egopose.envs.transformed import TransformedEgoPoseEnv
 from egopose.envs.transforms import StateNormalizer, TrackingError, VisualContext
 
 ROWS = arrays(np.float64, st.tuples(st.integers(1, 12), st.just(3)), elements=st.floats(-1e4, 1e4, width=32))

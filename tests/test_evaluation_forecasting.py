@@ -7,7 +7,8 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
-from egopose.evaluation.forecasting import ForecastWindow, forecast_windows, score_forecasts, true_futures
+from egopose.data.windows import ForecastWindow, forecast_windows
+from egopose.evaluation.forecast_metrics import score_forecasts, true_futures
 
 
 class Piece(NamedTuple):

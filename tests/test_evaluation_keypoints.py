@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from egopose.config import compose_config
+from egopose.core.config import compose_config
+from egopose.core.errors import InputError
 from egopose.data.preparation import humanoid_of
-from egopose.errors import InputError
 from egopose.evaluation.keypoints import KEYPOINTS, motion_keypoints, read_openpose, side_view, side_view_error
 from egopose.evaluation.protocols import ContactSettings, score_take
 from egopose.motion import rotations as rot

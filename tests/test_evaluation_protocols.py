@@ -10,7 +10,7 @@ import pytest
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
-from egopose.config import config_dir
+from egopose.core.config import config_dir
 from egopose.evaluation import tables
 from egopose.evaluation.protocols import METRICS, ContactSettings, TakeScores, compare, score_take
 from egopose.humanoid.config import HumanoidConfig

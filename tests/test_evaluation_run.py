@@ -13,11 +13,12 @@ import torch
 from env_stand_in import Piece, group
 
 from egopose import pipeline
+from egopose.core.errors import InputError
 from egopose.data.reference import reference_states
 from egopose.envs.mdp.observations import humanoid_state
 from egopose.envs.problem import TakeTable
-from egopose.errors import InputError
-from egopose.evaluate import output_folder, physics_group, run_evaluation, summary
+from egopose.evaluation.estimation_run import run_evaluation, summary
+from egopose.evaluation.options import output_folder, physics_group
 from egopose.evaluation.report import TakeVideo, file_name
 from egopose.humanoid.config import HumanoidConfig, SimConfig
 from egopose.humanoid.model import build_humanoid

@@ -13,14 +13,14 @@ from test_training_pipeline import assert_equal, configuration, estimation_mater
 from torchrl.render import RenderConfig, render_policy
 
 from egopose import pipeline
-from egopose.errors import InputError
-from egopose.evaluation.survival import frames_survived
-from egopose.evaluators import BackgroundSurvival, checkpoint_evaluator
-from egopose.material import Material
-from egopose.torchrl_render import make_env, make_policy
-from egopose.training.checkpoint import find_checkpoint
+from egopose.checkpoint.checkpoint import find_checkpoint
+from egopose.core.errors import InputError
+from egopose.evaluation.torchrl_evaluator import BackgroundSurvival, checkpoint_evaluator
+from egopose.evaluation.torchrl_render import make_env, make_policy
+from egopose.tasks.dataset import Material
 from egopose.training.logging import CsvCurves
 from egopose.training.loop import Run, train
+from egopose.training.survival import frames_survived
 
 WORLDS, SEED = 5, 7
 

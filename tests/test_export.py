@@ -18,13 +18,14 @@ from test_motion_bvh_roundtrip import motions
 
 from egopose.benchmarks.export import as_markdown, round_trips
 from egopose.benchmarks.read_back import read_glb
-from egopose.config import compose_config
-from egopose.errors import InputError
-from egopose.export import main, run_export
+from egopose.core.config import compose_config
+from egopose.core.errors import InputError
+from egopose.export import main
 from egopose.humanoid.config import HumanoidConfig, SimConfig
+from egopose.humanoid.foot_geometry import sole_positions
 from egopose.humanoid.inverse_dynamics import ForceSettings, with_forces
 from egopose.humanoid.model import HumanoidModel, build_humanoid
-from egopose.humanoid.soles import sole_positions
+from egopose.inference.export import run_export
 from egopose.motion import rotations as rot
 from egopose.motion.ground_reaction import GroundReaction
 from egopose.motion.io import WRITERS, read_motion, write_motion

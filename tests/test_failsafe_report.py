@@ -14,18 +14,18 @@ from hypothesis import strategies as st
 from tensordict.nn import TensorDictModule
 from torchrl.envs import Compose, TransformedEnv
 
+from egopose.core.errors import InputError
 from egopose.envs.mdp.observations import humanoid_state
 from egopose.envs.transforms import StateNormalizer
-from egopose.errors import InputError
-from egopose.evaluation.survival import base_tracking
-from egopose.evaluation.triggers import CUT_SHORT, FALSE_ALARM, FORESEEN, LATE, as_dict, as_text, summary, take_triggers
+from egopose.evaluation.reset_threshold import chosen
+from egopose.evaluation.resets import CUT_SHORT, FALSE_ALARM, FORESEEN, LATE, as_dict, as_text, summary, take_triggers
+from egopose.inference.counterfactuals import Forks
 from egopose.inference.estimator import Estimate, estimate_takes
 from egopose.inference.failsafe import FailSafe, FailSafeSettings, paper_kappa
-from egopose.inference.forks import Forks
-from egopose.kappa import chosen
 from egopose.motion.io import read_motion, write_motion
 from egopose.motion.io.csv_table import write_csv
 from egopose.motion.motion import Motion
+from egopose.training.survival import base_tracking
 
 
 def estimate(frames: int, triggered: list[int], resets: list[int], fallen: list[int]) -> Estimate:

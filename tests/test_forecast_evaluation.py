@@ -17,24 +17,24 @@ import torch
 from env_stand_in import Piece, group
 
 from egopose import pipeline
+from egopose.core.errors import InputError
 from egopose.data.reference import reference_states
+from egopose.data.spans import Span
+from egopose.data.windows import ForecastWindow
 from egopose.envs.mdp.observations import humanoid_state
 from egopose.envs.problem import TakeTable
-from egopose.errors import InputError
-from egopose.estimate import require_estimation
-from egopose.evaluation.forecasting import ForecastWindow
+from egopose.evaluation.forecast_run import run_forecast_evaluation
 from egopose.evaluation.report import TakeVideo
-from egopose.forecast_contexts import _states, context_material, past_states
-from egopose.forecast_evaluation import run_forecast_evaluation
+from egopose.evaluation.reports import evaluation_report
 from egopose.humanoid.config import HumanoidConfig, SimConfig
 from egopose.humanoid.model import build_humanoid
 from egopose.inference.context_states import context_states
+from egopose.inference.forecast_contexts import _states, context_material, past_states
+from egopose.inference.video_regression import require_estimation
+from egopose.models.predictions import predict_span
 from egopose.models.regressor import StateRegressor
 from egopose.motion.io import read_motion
 from egopose.motion.motion import Motion
-from egopose.report import evaluation_report
-from egopose.training.fragments import Span
-from egopose.training.predictions import predict_span
 from egopose.vision.video import probe_video, write_video
 
 FRAMES, CONTEXT = 40, 5

@@ -14,11 +14,11 @@ from torchrl.modules import set_recurrent_mode
 from toy_problem import COLLECTOR, LOOP, SETTINGS
 
 from egopose import pipeline
+from egopose.core.errors import InputError
 from egopose.envs.starts import Piece, after_context
-from egopose.errors import InputError
-from egopose.material import Material
 from egopose.models.context import ForwardContext
 from egopose.models.recurrent import PastContext, collecting_policy, hidden_keys
+from egopose.tasks.dataset import Material
 from egopose.training.loop import train
 
 CONTEXT, HORIZON = 5, 8

@@ -23,14 +23,14 @@ import torch
 from tensordict import TensorDict
 from torchrl.checkpoint import GlobalRNGState
 
-from egopose.config import check_arguments, compose_config
+from egopose.checkpoint.checkpoint import CHECKSUMS, RunCheckpoint, _checksums, metadata_of, read_json
+from egopose.core.config import check_arguments, compose_config
+from egopose.core.errors import InputError
+from egopose.core.safe_io import MAX_CHECKPOINT_BYTES, load_tensors, read_yaml
 from egopose.data.store import TakeInfo, TakeStore
-from egopose.errors import InputError
 from egopose.motion.io import read_motion
 from egopose.motion.motion import Motion
 from egopose.motion.skeleton import Joint, Skeleton, hinges
-from egopose.training.checkpoint import CHECKSUMS, RunCheckpoint, _checksums, metadata_of, read_json
-from egopose.untrusted import MAX_CHECKPOINT_BYTES, load_tensors, read_yaml
 from egopose.vision.video import read_frames, write_video
 
 ROOT = Path(__file__).resolve().parents[1]

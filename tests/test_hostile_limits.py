@@ -30,9 +30,9 @@ elif kind == "video":
     from egopose.vision.video import iter_frames, probe_video
     read = lambda path: (probe_video(path), sum(1 for _ in iter_frames(path)))
 else:
-    from egopose.untrusted import read_json
+    from egopose.core.safe_io import read_json
     read = lambda path: read_json(path, "x")
-from egopose.errors import InputError
+from egopose.core.errors import InputError
 
 mapped = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
 resource.setrlimit(resource.RLIMIT_AS, (mapped + 2**31, mapped + 2**31))

@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 from mocap import default_config, default_humanoid, rig_motion
 
-from egopose.config import compose_config
+from egopose.core.config import compose_config
+from egopose.core.errors import InputError
 from egopose.data.prepare_motion import reference_motion
-from egopose.errors import InputError
 from egopose.humanoid.config import HumanoidConfig, SimConfig
+from egopose.humanoid.foot_geometry import out_of_floor
 from egopose.humanoid.from_motion import config_from_motion, humanoid_from_motion
 from egopose.humanoid.model import build_humanoid, sole_points
-from egopose.humanoid.soles import out_of_floor
 from egopose.motion import rotations as rot
 from egopose.motion.io import read_motion
 from egopose.motion.kinematics import forward_kinematics

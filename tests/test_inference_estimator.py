@@ -11,11 +11,11 @@ from torchrl.envs import Compose, TransformedEnv
 
 from egopose.envs.mdp.observations import humanoid_state
 from egopose.envs.transforms import StateNormalizer
-from egopose.evaluation.survival import action_towards, base_tracking, frames_survived, reference_tracking
-from egopose.humanoid.soles import out_of_floor, sole_edges
+from egopose.humanoid.foot_geometry import out_of_floor, sole_edges
 from egopose.inference.estimator import Estimate, estimate_takes
 from egopose.inference.failsafe import FailSafe, FailSafeSettings
 from egopose.motion.motion import Motion
+from egopose.training.survival import action_towards, base_tracking, frames_survived, reference_tracking
 
 NEVER_FALL = {"termination": {"enabled": False, "head_drop": 0.1}}
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from egopose.errors import InputError
+from egopose.core.errors import InputError
 from egopose.inference.failsafe import FailSafe, FailSafeSettings
 
 

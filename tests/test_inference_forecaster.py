@@ -10,9 +10,9 @@ import torch
 from test_forecasting_training import CONTEXT, configuration, forecasting_material
 
 from egopose import pipeline
+from egopose.data.windows import ForecastWindow
 from egopose.envs.mdp.observations import humanoid_state
-from egopose.evaluation.forecasting import ForecastWindow
-from egopose.humanoid.soles import out_of_floor
+from egopose.humanoid.foot_geometry import out_of_floor
 from egopose.inference.bands import fit_scale, quantile_bands
 from egopose.inference.forecaster import Forecasts, forecast, placed_states
 

@@ -13,16 +13,17 @@ from env_stand_in import group
 from toy_problem import COLLECTOR, LOOP, SETTINGS
 
 from egopose import pipeline
-from egopose.config import from_mapping
-from egopose.errors import InputError
-from egopose.estimate import estimate_video, seen_in, video_material
+from egopose.checkpoint.checkpoint import RunCheckpoint, metadata_of
+from egopose.core.config import from_mapping
+from egopose.core.errors import InputError
+from egopose.data.spans import Span
 from egopose.humanoid.config import HumanoidConfig, SimConfig
 from egopose.humanoid.model import build_humanoid
+from egopose.inference.video import estimate_video
+from egopose.inference.video_regression import seen_in, video_material
+from egopose.models.regressor_settings import RegressorSettings
 from egopose.motion.io import read_motion
-from egopose.training.checkpoint import RunCheckpoint, metadata_of
-from egopose.training.fragments import Span
-from egopose.training.regressor_settings import RegressorSettings
-from egopose.training.supervised import build_regressor
+from egopose.training.regressor import build_regressor
 from egopose.vision.encoders import build_encoder
 from egopose.vision.video import probe_video, write_video
 

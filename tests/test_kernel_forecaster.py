@@ -19,32 +19,33 @@ from test_material import configuration, fill_flow
 from test_motion_forecast import FPS, SMALL, contexts_of, settings, unmirrored, wave
 from torch import Tensor, nn
 
-from egopose import motion_forecasts, regression
-from egopose.config import from_mapping
+from egopose.checkpoint.checkpoint import ComponentState, RunCheckpoint, has_component, metadata_of
+from egopose.checkpoint.package import _copy_components
+from egopose.core.config import from_mapping
+from egopose.core.errors import InputError
+from egopose.core.runtime import torch_threads
 from egopose.data.preparation import flow_name, humanoid_of, prepare
+from egopose.data.spans import Span, cross_fit_blocks
 from egopose.data.splits import split_takes
 from egopose.data.store import TakeStore
 from egopose.envs.mdp.observations import humanoid_state
-from egopose.errors import InputError
 from egopose.inference.context_states import context_states
-from egopose.material import Material, take_table
 from egopose.models.kernel_regression import fit_kernel_regression
 from egopose.models.mirror import StateMirror, state_mirror
 from egopose.models.motion_forecast import KernelForecaster, spline_basis, spline_times
-from egopose.motion_forecasts import FOLDER, PARTS, ForecastCurves, Members, with_futures
-from egopose.regression import load_regressor, regressor_name, regressor_tables, training_contexts
-from egopose.runtime import torch_threads
-from egopose.ship import _copy_components
-from egopose.training import blending
+from egopose.models.predictions import predict_takes
+from egopose.pipeline import forecaster as motion_forecasts
+from egopose.pipeline import regressor as regression
+from egopose.pipeline.forecaster import FOLDER, PARTS, ForecastCurves, Members, with_futures
+from egopose.pipeline.regressor import load_regressor, regressor_name, regressor_tables, training_contexts
+from egopose.tasks.dataset import Material, take_table
+from egopose.training import blended_regressor as blending
 from egopose.training import past_contexts as past
-from egopose.training.blending import KernelSettings
-from egopose.training.checkpoint import ComponentState, RunCheckpoint, has_component, metadata_of
+from egopose.training.blended_regressor import KernelSettings
 from egopose.training.continued_forecast import continued_share
-from egopose.training.fragments import Span, cross_fit_blocks
 from egopose.training.kernel_forecast import Contexts, blank_kernel_forecaster, fit_kernel_forecaster
 from egopose.training.motion_forecast import ForecastLearner, build_forecaster, cross_fit_starts
 from egopose.training.past_contexts import past_contexts
-from egopose.training.predictions import predict_takes
 
 HERE: dict[str, Any] = {
     "bins": [2, 3], "axes": 1000, "whitening": 0.5, "ridge": 0.1, "length": 1.0, "centres": 1000, "share": 0.3,

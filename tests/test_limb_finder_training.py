@@ -12,13 +12,13 @@ import torch
 
 import egopose
 from egopose import limbs
-from egopose.config import compose_config
+from egopose.checkpoint.checkpoint import RunCheckpoint, read_json
+from egopose.core.config import compose_config
+from egopose.core.errors import InputError
 from egopose.data.preparation import humanoid_of
-from egopose.errors import InputError
 from egopose.motion.skeleton import Skeleton
-from egopose.training import limb_finder
-from egopose.training.checkpoint import RunCheckpoint, read_json
-from egopose.training.limb_finder import (
+from egopose.training import body_parts as limb_finder
+from egopose.training.body_parts import (
     FinderSettings,
     FinderTraining,
     Pictures,
@@ -28,9 +28,9 @@ from egopose.training.limb_finder import (
     train_finder,
     varied,
 )
+from egopose.vision.body_part_pictures import posture_names
+from egopose.vision.body_parts import LIMBS, LimbFinder
 from egopose.vision.flow import FlowConfig
-from egopose.vision.limb_pictures import posture_names
-from egopose.vision.limbs import LIMBS, LimbFinder
 
 WALK = Path(egopose.__file__).parent / "assets" / "clips" / "deepmimic_walk.motion.npz"
 SMALL = ["training.channels=8", "training.batch=4", "training.threads=1", "training.bfloat16=false"]

@@ -12,17 +12,16 @@ import pytest
 import torch
 
 import egopose
-from egopose.config import compose_config
+from egopose.checkpoint.checkpoint import RunCheckpoint, read_json
+from egopose.core.config import compose_config
+from egopose.core.errors import InputError
 from egopose.data.preparation import humanoid_of
-from egopose.errors import InputError
 from egopose.humanoid.model import HumanoidModel
-from egopose.limbs import base_clips, motion_files
 from egopose.motion import rotations as rot
 from egopose.motion.kinematics import forward_kinematics
-from egopose.training.checkpoint import RunCheckpoint, read_json
-from egopose.training.limb_finder import Pictures, held_out_figures, mirrored, posture_mirror
-from egopose.vision.flow import FlowConfig
-from egopose.vision.limb_pictures import (
+from egopose.pipeline.body_parts import base_clips, motion_files
+from egopose.training.body_parts import Pictures, held_out_figures, mirrored, posture_mirror
+from egopose.vision.body_part_pictures import (
     ARRAYS,
     BODIES,
     LIMB_BODIES,
@@ -36,7 +35,8 @@ from egopose.vision.limb_pictures import (
     posture_names,
     read_pictures,
 )
-from egopose.vision.limbs import FLOW, LIMBS, LimbFinder
+from egopose.vision.body_parts import FLOW, LIMBS, LimbFinder
+from egopose.vision.flow import FlowConfig
 from egopose.vision.rendering import WEARER_CAMERA, camera_orientations
 from egopose.vision.rooms import room_seed
 from egopose.vision.takes import RenderConfig

@@ -15,26 +15,36 @@ from live_stand_in import run_config, untrained, write_walk
 from test_blended import KERNEL, blended
 from test_material import configuration, fill_flow
 
-from egopose import regression, sight, stream
-from egopose.config import compose_config, from_mapping
+from egopose import stream
+from egopose.checkpoint import checkpoint
+from egopose.core.config import compose_config, from_mapping
+from egopose.core.errors import InputError
 from egopose.data.preparation import flow_name, humanoid_of, prepare
 from egopose.data.store import TakeStore
-from egopose.errors import InputError
 from egopose.inference.causal import CausalRegression
-from egopose.inference.stream.sight import Sight
+from egopose.inference.stream.frame_features import Sight
 from egopose.models.blended import TimeWindows, blended_regressor, flow_cells, kernel_view
 from egopose.models.kernel_regression import KernelRegression
+from egopose.models.predictions import take_frames
 from egopose.models.regressor import StateRegressor
-from egopose.regression import kept_tables, load_regressor, regressor_name, regressor_tables
-from egopose.sight import FlowAndLimbs, finder_fingerprint, finder_of, load_finder_of, planes_of, seen_in_store
-from egopose.training import blending, checkpoint
-from egopose.training.blending import KernelSettings
-from egopose.training.predictions import take_frames
+from egopose.pipeline import regressor as regression
+from egopose.pipeline import regressor_input as sight
+from egopose.pipeline.regressor import kept_tables, load_regressor, regressor_name, regressor_tables
+from egopose.pipeline.regressor_input import (
+    FlowAndLimbs,
+    finder_fingerprint,
+    finder_of,
+    load_finder_of,
+    planes_of,
+    seen_in_store,
+)
+from egopose.training import blended_regressor as blending
+from egopose.training.blended_regressor import KernelSettings
+from egopose.vision.body_parts import LimbFinder, as_plane, limb_rows, load_finder, small_picture
 from egopose.vision.encoders import LightFlowEncoder
 from egopose.vision.features import extract_flow, extract_limbs
 from egopose.vision.flow import FlowConfig
 from egopose.vision.lens import Camera
-from egopose.vision.limbs import LimbFinder, as_plane, limb_rows, load_finder, small_picture
 from egopose.vision.video import iter_frames
 
 FLOW = FlowConfig(preset="ultrafast", working_size=128, stored_size=32, workers=1)
@@ -89,7 +99,7 @@ def test_each_row_is_of_a_frame_and_the_one_before_in_whatever_batch(
     flow = (0.05 * draw.normal(size=(9, 2, 32, 32))).astype(np.float16)
     rows = limb_rows(finder, pictures, flow)
     assert rows.dtype == np.float16
-    monkeypatch.setattr("egopose.vision.limbs._BATCH", 4)
+    monkeypatch.setattr("egopose.vision.body_parts._BATCH", 4)
     np.testing.assert_allclose(limb_rows(finder, list(pictures), flow), rows, atol=4e-3)
     for frame, before in ((0, 0), (1, 0), (4, 3), (8, 7)):
         pair = (torch.from_numpy(pictures[i]).permute(2, 0, 1)[None] for i in (before, frame))

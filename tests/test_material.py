@@ -17,15 +17,16 @@ import pytest
 import torch
 from mocap import short_clips
 
-from egopose import material, pipeline, regression
-from egopose.config import compose_config
+from egopose import material, pipeline
+from egopose.checkpoint.checkpoint import find_checkpoint
+from egopose.core.config import compose_config
+from egopose.core.errors import InputError
 from egopose.data import preparation
 from egopose.data.lock import store_lock
 from egopose.data.preparation import fingerprint_of, flow_name, humanoid_of, prepare, store_folder
 from egopose.data.store import TakeStore
-from egopose.errors import InputError
-from egopose.regression import kept_tables, load_regressor, regressor_name, regressor_tables
-from egopose.training.checkpoint import find_checkpoint
+from egopose.pipeline import regressor as regression
+from egopose.pipeline.regressor import kept_tables, load_regressor, regressor_name, regressor_tables
 from egopose.training.loop import train
 
 
@@ -317,7 +318,7 @@ def test_a_feature_file_that_vanished_is_named_and_put_back_the_run_goes_on(copi
 def test_imports_are_quiet_without_a_screen_and_force_no_backend() -> None:
     program = (
         "import logging, os; logging.basicConfig(level=logging.INFO)\n"
-        "from egopose.runtime import prepare_runtime; prepare_runtime()\n"
+        "from egopose.core.runtime import prepare_runtime; prepare_runtime()\n"
         "before = os.environ.get('MUJOCO_GL')\n"
         "from dm_control import mujoco\n"
         "assert os.environ.get('MUJOCO_GL') == before\n"

@@ -18,27 +18,27 @@ from test_limbs_seen import assert_frame_by_frame_as_the_video_up_to_there
 from test_material import configuration, fill_flow
 from torch import Tensor
 
-from egopose import weights
-from egopose.config import from_mapping
+from egopose.checkpoint import pretrained as weights
+from egopose.checkpoint.checkpoint import read_json
+from egopose.core.config import from_mapping
+from egopose.core.errors import InputError
 from egopose.data.preparation import flow_name, humanoid_of, prepare
+from egopose.data.spans import Span, cross_fit_blocks, without_block
 from egopose.data.store import TakeStore
 from egopose.envs.mdp.observations import humanoid_state
-from egopose.errors import InputError
-from egopose.estimate import seen_in
 from egopose.humanoid.model import HumanoidModel
+from egopose.inference.video_regression import seen_in
 from egopose.models.blended import MeanOfKernels, TimeWindows, blended_regressor
 from egopose.models.kernel_regression import KernelRegression, fit_kernel_regression
 from egopose.models.mirror import StateMirror, state_mirror
 from egopose.models.regressor import StateRegressor
-from egopose.regression import load_regressor, regressor_name, regressor_tables
-from egopose.training import blending
-from egopose.training.blending import KernelSettings, fit_kernels, window_table
-from egopose.training.checkpoint import read_json
-from egopose.training.fragments import Span, cross_fit_blocks, without_block
-from egopose.training.limb_finder import posture_mirror, save_finder
+from egopose.pipeline.regressor import load_regressor, regressor_name, regressor_tables
+from egopose.training import blended_regressor as blending
+from egopose.training.blended_regressor import KernelSettings, fit_kernels, window_table
+from egopose.training.body_parts import posture_mirror, save_finder
+from egopose.vision.body_parts import LimbFinder, as_plane, load_finder
 from egopose.vision.encoders import LightFlowEncoder
 from egopose.vision.flow import FlowConfig
-from egopose.vision.limbs import LimbFinder, as_plane, load_finder
 
 ALSO = ((6, 3, 1.0), (0, 1, 1.5))
 COUNTS = (3, 5, 1)

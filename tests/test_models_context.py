@@ -7,7 +7,7 @@ import torch
 from tensordict import TensorDict
 from torch import nn
 
-from egopose.errors import InputError
+from egopose.core.errors import InputError
 from egopose.models import episode_context
 from egopose.models.context import BidirectionalContext, ForwardContext
 from egopose.models.episode_context import EpisodeContext, episode_context_module

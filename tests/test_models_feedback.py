@@ -10,9 +10,9 @@ import yaml
 from mocap import default_humanoid
 from tensordict import TensorDict
 
-from egopose.config import from_mapping
+from egopose.core.config import from_mapping
+from egopose.core.errors import InputError
 from egopose.envs.mdp.observations import humanoid_state
-from egopose.errors import InputError
 from egopose.models.feedback import BalanceFeedback, FeedbackSettings
 
 HINGES = [f"{joint.name}_{k}" for joint in default_humanoid().skeleton.joints for k in range(len(joint.dofs))]

@@ -15,7 +15,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
 
-from egopose.errors import InputError
+from egopose.core.errors import InputError
 from egopose.models.feedback import BalanceFeedback
 from egopose.models.policy import PolicySettings, build_actor, build_critic
 

@@ -9,8 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from tensordict import TensorDict
 
+from egopose.core.errors import InputError
 from egopose.envs.mdp.observations import humanoid_state
-from egopose.errors import InputError
 from egopose.models.mirror import joint_mirror, state_mirror
 from egopose.models.pose_regression import pose_regression, split_state, state_to_qpos
 from egopose.models.regressor import StateRegressor, state_statistics

@@ -19,20 +19,20 @@ from hypothesis import strategies as st
 from torch import nn
 
 from egopose import pipeline
-from egopose.envs.futures import Futures
+from egopose.checkpoint.checkpoint import ComponentState, RunCheckpoint, metadata_of
+from egopose.checkpoint.package import _copy_components
+from egopose.core.errors import InputError
+from egopose.data.spans import Span, cross_fit_blocks, group_blocks
+from egopose.data.windows import ForecastWindow
 from egopose.envs.mdp.observations import humanoid_state
-from egopose.errors import InputError
+from egopose.envs.reference_forecasts import Futures
 from egopose.evaluation import metrics
-from egopose.evaluation.forecasting import ForecastWindow
-from egopose.material import Material
 from egopose.models.mirror import StateMirror
 from egopose.models.motion_forecast import spline_basis
 from egopose.motion import rotations as rot
-from egopose.motion_forecasts import FOLDER, begin_forecasts, with_futures
-from egopose.ship import _copy_components
-from egopose.training.baselines import FitSettings, fit
-from egopose.training.checkpoint import ComponentState, RunCheckpoint, metadata_of
-from egopose.training.fragments import Span, cross_fit_blocks, group_blocks
+from egopose.pipeline.forecaster import FOLDER, begin_forecasts, with_futures
+from egopose.tasks.dataset import Material
+from egopose.training.fitting import FitSettings, fit
 from egopose.training.kernel_forecast import Contexts
 from egopose.training.motion_forecast import ForecasterSettings, ForecastLearner, build_forecaster, cross_fit_starts
 

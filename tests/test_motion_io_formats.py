@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from egopose.errors import InputError
+from egopose.core.errors import InputError
 from egopose.motion import rotations as rot
 from egopose.motion.io import read_motion, write_motion
 from egopose.motion.io.frames import UP_AXES, continuous_euler, euler_angles, frame_rate, from_euler, up_rotation

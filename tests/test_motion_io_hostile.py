@@ -15,7 +15,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from egopose.errors import InputError
+from egopose.core.errors import InputError
 from egopose.motion.io import _npz, read_motion, write_motion
 from egopose.motion.motion import Motion
 from egopose.motion.skeleton import Joint, Skeleton, hinges

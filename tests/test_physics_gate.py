@@ -18,13 +18,13 @@ import pytest
 from conftest import SHARED
 from mocap import default_humanoid
 
-from egopose.config import compose_config
+from egopose.core.config import compose_config
 from egopose.data import gate
 from egopose.data.feasibility import contact_residual
 from egopose.data.gate import GateResult, gate_sources, open_loop_gate
 from egopose.data.prepare_motion import PreparationSettings, reference_motion
-from egopose.data.sources import find_sources
-from egopose.humanoid.soles import sole_positions
+from egopose.data.take_sources import find_sources
+from egopose.humanoid.foot_geometry import sole_positions
 from egopose.motion.ground import raised
 from egopose.motion.io import read_motion
 

@@ -19,17 +19,18 @@ from test_planning import SMALL, settings
 from torch import Tensor
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from egopose import forecast_evaluation, pipeline
-from egopose.envs.futures import Futures
+from egopose import pipeline
+from egopose.core.runtime import torch_threads
+from egopose.data.windows import ForecastWindow
 from egopose.envs.mdp.observations import humanoid_state
-from egopose.evaluation.forecasting import ForecastWindow
-from egopose.forecast_evaluation import ForecastSettings, forecast_windows_of
+from egopose.envs.reference_forecasts import Futures
+from egopose.evaluation import forecast_run as forecast_evaluation
+from egopose.evaluation.forecast_run import ForecastSettings, forecast_windows_of
 from egopose.inference.estimator import prepare_for_test
 from egopose.inference.forecaster import forecast
+from egopose.inference.planner import Planner, followed_futures
 from egopose.inference.planner_settings import PlannerSettings
-from egopose.inference.planning import Planner, followed_futures
-from egopose.material import Material
-from egopose.runtime import torch_threads
+from egopose.tasks.dataset import Material
 
 WINDOWS = [ForecastWindow(0, 0, 5, 12), ForecastWindow(0, 9, 5, 12), ForecastWindow(0, 4, 5, 12)]
 TEST = {"whole_fragments": True, "falls_end": False}

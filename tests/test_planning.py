@@ -17,21 +17,21 @@ from tensordict.nn import TensorDictModule
 from torch import Tensor
 from torchrl.envs import Compose, TransformedEnv
 
-from egopose.config import compose_config
+from egopose.core.config import compose_config
+from egopose.core.errors import InputError
+from egopose.core.runtime import prefer_quick_products
 from egopose.envs.build import build_problem
 from egopose.envs.env import EgoPoseEnv
-from egopose.envs.forecasting import RecurrentStates
+from egopose.envs.forecasting_transforms import RecurrentStates
 from egopose.envs.mdp.observations import humanoid_state
 from egopose.envs.starts import Piece
 from egopose.envs.transforms import StateNormalizer
-from egopose.errors import InputError
-from egopose.estimate import allowed_planner
 from egopose.evaluation.agents import estimate_and_judge
 from egopose.inference.estimator import Estimate, estimate_takes
 from egopose.inference.failsafe import FailSafe, FailSafeSettings
+from egopose.inference.planner import Planner
 from egopose.inference.planner_settings import PlannerSettings, planner_settings
-from egopose.inference.planning import Planner
-from egopose.runtime import prefer_quick_products
+from egopose.inference.video import allowed_planner
 
 FRAMES = 60
 PIECES = (Piece(0, 0, FRAMES), Piece(1, 0, FRAMES))

@@ -17,21 +17,22 @@ import pytest
 from env_stand_in import group
 from hydra import compose, initialize_config_dir
 
-from egopose.config import compose_config, config_dir
-from egopose.errors import InputError
+from egopose.core.config import compose_config, config_dir
+from egopose.core.errors import InputError
 from egopose.evaluation import page
 from egopose.evaluation.agents import FragmentResult, failsafe_figures
 from egopose.evaluation.charts import Line, bar_chart, line_chart, ticks
-from egopose.evaluation.html_report import ReportSettings, read_takes, worst_and_best, write_report
+from egopose.evaluation.estimation_page import ReportSettings, read_takes, worst_and_best, write_report
 from egopose.evaluation.protocols import METRICS, ContactSettings, score_take
 from egopose.evaluation.report import compare_runs, write_results, write_take
-from egopose.evaluation.triggers import take_triggers
+from egopose.evaluation.reports import run_report
+from egopose.evaluation.resets import take_triggers
 from egopose.humanoid.config import HumanoidConfig, SimConfig
 from egopose.humanoid.model import HumanoidModel, build_humanoid
 from egopose.inference.estimator import Estimate
 from egopose.inference.failsafe import FailSafeSettings
 from egopose.motion.motion import Motion
-from egopose.report import main, run_report
+from egopose.report import main
 
 SETTINGS = ReportSettings(moments=2, apart=0.3, size=96, takes=None)
 FRAMES = 40

@@ -12,18 +12,18 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from mocap import RIGS, default_humanoid, rig_motion
 
+from egopose.core.errors import InputError
 from egopose.data.prepare_motion import low_pass, reference_motion, without_lead_in
-from egopose.errors import InputError
-from egopose.humanoid.soles import sole_names, sole_positions
+from egopose.humanoid.foot_geometry import sole_names, sole_positions
 from egopose.motion import rotations as rot
+from egopose.motion.foot_contact_ik import plant_feet
+from egopose.motion.ground_alignment import SettleSettings, settle
 from egopose.motion.inverse_kinematics import Targets, solve
 from egopose.motion.io import read_motion
 from egopose.motion.kinematics import forward_kinematics
 from egopose.motion.mapping import identify, side_of
 from egopose.motion.motion import Motion
-from egopose.motion.plant import plant_feet
 from egopose.motion.retarget import retarget
-from egopose.motion.settle import SettleSettings, settle
 from egopose.motion.skeleton import Joint, Skeleton, hinges
 
 HUMANOID = default_humanoid()

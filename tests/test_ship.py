@@ -18,15 +18,17 @@ import torch
 from hatchling.builders.wheel import WheelBuilder
 from torchrl.checkpoint import Checkpoint
 
-from egopose import pipeline, weights
-from egopose.config import compose_config
+from egopose import pipeline
+from egopose.checkpoint import pretrained as weights
+from egopose.checkpoint.checkpoint import find_checkpoint, read_json, seal
+from egopose.checkpoint.package import ship
+from egopose.core.config import compose_config
+from egopose.core.errors import InputError
 from egopose.data.preparation import humanoid_of
-from egopose.errors import InputError
-from egopose.estimate import estimate_video, seen_in, video_material
-from egopose.evaluate import data_at, output_folder
-from egopose.regression import load_regressor
-from egopose.ship import ship
-from egopose.training.checkpoint import find_checkpoint, read_json, seal
+from egopose.evaluation.options import data_at, output_folder
+from egopose.inference.video import estimate_video
+from egopose.inference.video_regression import seen_in, video_material
+from egopose.pipeline.regressor import load_regressor
 from egopose.vision.video import write_video
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -16,17 +16,18 @@ from live_stand_in import untrained, write_walk
 from test_inference_video import run, settings  # noqa: F401  # a fixture
 from torch import nn
 
-from egopose.config import compose_config
-from egopose.errors import InputError
-from egopose.estimate import causal_regression, estimate_video, seen_live, video_material
+from egopose.core.config import compose_config
+from egopose.core.errors import InputError
+from egopose.core.runtime import torch_threads
 from egopose.inference.causal import CausalRegression, Seen
 from egopose.inference.estimator import estimate_takes
 from egopose.inference.failsafe import FailSafe, FailSafeSettings
-from egopose.inference.stream.body import LiveBody, LivePose
+from egopose.inference.stream.build import Trained, build_loop, source_settings, stream
+from egopose.inference.stream.live_body import LiveBody, LivePose
+from egopose.inference.video import estimate_video
+from egopose.inference.video_regression import causal_regression, seen_live, video_material
 from egopose.motion.io import read_motion
-from egopose.pipeline import build_env
-from egopose.runtime import torch_threads
-from egopose.stream import Trained, build_loop, source_settings, stream
+from egopose.pipeline.environment import build_env
 from egopose.vision.features import extract_flow
 
 FRAMES, LOOKAHEAD = 40, 10

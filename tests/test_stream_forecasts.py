@@ -20,22 +20,15 @@ from test_inference_video import run  # noqa: F401  # a fixture
 from egopose import pipeline
 from egopose.benchmarks import stream as bench
 from egopose.benchmarks.stream import untrained_forecaster
-from egopose.config import compose_config
-from egopose.envs.futures import FollowFuture
-from egopose.errors import InputError
+from egopose.checkpoint.checkpoint import ComponentState, RunCheckpoint, metadata_of
+from egopose.core.config import compose_config
+from egopose.core.errors import InputError
+from egopose.core.runtime import torch_threads
+from egopose.envs.reference_forecasts import FollowFuture
 from egopose.inference.context_states import context_states
 from egopose.inference.forecaster import forecast
 from egopose.inference.stream import messages
-from egopose.inference.stream.forecast_recording import ForecastRecording
-from egopose.inference.stream.forecasting import ForecastThread
-from egopose.inference.stream.futures import ForecastSettings, LiveForecast, LiveFutures, Moment
-from egopose.inference.stream.latency import LatencyTable
-from egopose.inference.stream.outputs import open_outputs
-from egopose.models.recurrent import PastContext
-from egopose.motion.io.native import skeleton_from_json
-from egopose.motion_forecasts import still_futures
-from egopose.runtime import torch_threads
-from egopose.stream import (
+from egopose.inference.stream.build import (
     Forecaster,
     Trained,
     build_loop,
@@ -45,7 +38,14 @@ from egopose.stream import (
     still_frames,
     stream,
 )
-from egopose.training.checkpoint import ComponentState, RunCheckpoint, metadata_of
+from egopose.inference.stream.forecast_recording import ForecastRecording
+from egopose.inference.stream.forecasting import ForecastThread
+from egopose.inference.stream.latency import LatencyTable
+from egopose.inference.stream.live_forecasts import ForecastSettings, LiveForecast, LiveFutures, Moment
+from egopose.inference.stream.outputs import open_outputs
+from egopose.models.recurrent import PastContext
+from egopose.motion.io.native import skeleton_from_json
+from egopose.pipeline.forecaster import still_futures
 from egopose.training.continued_forecast import blank_continued_forecaster
 from egopose.training.kernel_forecast import blank_kernel_forecaster
 from egopose.training.motion_forecast import ForecasterSettings, build_forecaster

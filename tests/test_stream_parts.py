@@ -16,23 +16,24 @@ from hypothesis import given
 from hypothesis import strategies as st
 from live_stand_in import write_walk
 
-from egopose.errors import InputError
-from egopose.inference.stream import messages, sources
-from egopose.inference.stream.body import LivePose
+from egopose.core.errors import InputError
+from egopose.inference.stream import frame_sources as sources
+from egopose.inference.stream import messages
 from egopose.inference.stream.broadcast import ServerSettings
 from egopose.inference.stream.clock import ControlClock
-from egopose.inference.stream.latency import LatencyTable
-from egopose.inference.stream.memory import MemoryTrace
-from egopose.inference.stream.newest import Captured, NewestFrame
-from egopose.inference.stream.recording import Recording
-from egopose.inference.stream.sight import Sight
-from egopose.inference.stream.sources import (
+from egopose.inference.stream.frame_features import Sight
+from egopose.inference.stream.frame_sources import (
     PictureTimes,
     ReconnectSettings,
     SourceSettings,
     capture,
     check_source,
 )
+from egopose.inference.stream.latency import LatencyTable
+from egopose.inference.stream.live_body import LivePose
+from egopose.inference.stream.memory import MemoryTrace
+from egopose.inference.stream.newest_frame import Captured, NewestFrame
+from egopose.inference.stream.recording import Recording
 from egopose.motion.io import read_motion
 from egopose.motion.io.native import skeleton_from_json
 from egopose.motion.skeleton import Dof, Joint, Skeleton

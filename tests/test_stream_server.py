@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from egopose.errors import InputError
+from egopose.core.errors import InputError
 from egopose.inference.stream.broadcast import Broadcast, ServerSettings
 
 pytest.importorskip("websockets")

@@ -11,8 +11,8 @@ from typing import Any
 import pytest
 import yaml
 
-from egopose.config import compose_config
-from egopose.errors import InputError
+from egopose.core.config import compose_config
+from egopose.core.errors import InputError
 
 STUDY = Path(__file__).resolve().parents[1] / "experiments" / "study"
 

@@ -16,14 +16,14 @@ from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 from torch import Tensor, nn
 
-from egopose.config import from_mapping
-from egopose.errors import InputError
+from egopose.core.config import from_mapping
+from egopose.core.errors import InputError
+from egopose.data.spans import Span, cross_fit_blocks, split_validation, training_windows, without_block
 from egopose.models.mirror import StateMirror
+from egopose.models.predictions import predict_span, predict_takes, regression_error
 from egopose.models.regressor import StateRegressor
-from egopose.training.fragments import Span, cross_fit_blocks, split_validation, training_windows, without_block
-from egopose.training.predictions import predict_span, predict_takes, regression_error
-from egopose.training.regressor_settings import RegressorSettings, learning_rate_at
-from egopose.training.supervised import Progress, State, build_regressor, train_regressor
+from egopose.models.regressor_settings import RegressorSettings, learning_rate_at
+from egopose.training.regressor import Progress, State, build_regressor, train_regressor
 
 CONF = Path(__file__).resolve().parents[1] / "conf" / "regressor"
 FRAGMENTS = [Span(0, 700), Span(700, 1500)]

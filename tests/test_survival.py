@@ -22,14 +22,14 @@ from toy_problem import make_run
 
 from egopose import bench
 from egopose.benchmarks.processes import end_of, family
+from egopose.checkpoint import checkpoint as checkpoints
+from egopose.checkpoint.resume import continued_job, finished, mark_finished, only_process
+from egopose.core.errors import InputError
+from egopose.core.safe_io import load_tensors
 from egopose.envs.transforms import VisualContext
-from egopose.errors import InputError
-from egopose.training import checkpoint as checkpoints
 from egopose.training.logging import CsvCurves
 from egopose.training.loop import Run, TrainingStopped, interrupts_held, train
 from egopose.training.ppo import TrainingDiverged
-from egopose.training.resume import continued_job, finished, mark_finished, only_process
-from egopose.untrusted import load_tensors
 
 __all__ = ["launcher"]  # a fixture
 
@@ -158,10 +158,8 @@ FULL_DISK = """
 import resource, sys
 from pathlib import Path
 sys.path.insert(0, {tests!r})
-from egopose.runtime import prepare_runtime
-prepare_runtime()
 from toy_problem import make_run
-from egopose.training.checkpoint import recover, verify
+from egopose.checkpoint.checkpoint import recover, verify
 from egopose.training.logging import build_loggers
 from egopose.training.loop import TrainingStopped, train
 
@@ -241,12 +239,10 @@ def test_workers_outlive_ctrl_c_and_are_missed_when_killed(tmp_path: Path) -> No
 LONG_STEP = """
 import os, sys, time
 sys.path.insert(0, {tests!r})
-from egopose.runtime import prepare_runtime
-prepare_runtime()
 from functools import partial
 from torchrl.envs import TransformedEnv
 from toy_problem import COLLECTOR, ToyEnv, networks
-from egopose.training.collectors import CollectorSettings, build_collector
+from egopose.collection.collectors import CollectorSettings, build_collector
 
 class Slow(ToyEnv):
     def _step(self, tensordict):

@@ -15,14 +15,14 @@ from hypothesis import strategies as st
 from test_training_pipeline import assert_equal, configuration, estimation_material
 
 from egopose import pipeline
-from egopose.config import compose_config
+from egopose.core.config import compose_config
+from egopose.core.errors import InputError
 from egopose.envs.aids import AdaptiveStartSettings, Aids, ramp
 from egopose.envs.env import EgoPoseEnv
 from egopose.envs.mdp import rotations as rot
 from egopose.envs.starts import AdaptiveStarts
-from egopose.errors import InputError
 from egopose.humanoid.physics import BatchedPhysics
-from egopose.material import Material
+from egopose.tasks.dataset import Material
 from egopose.training.loop import iterate, train
 
 STARTS = AdaptiveStartSettings(bin=5, unit=3.0, rate=0.5, floor=0.2)

@@ -20,15 +20,15 @@ from tensordict import TensorDictBase
 from torchrl.envs import Compose, RenameTransform, TransformedEnv
 from toy_problem import COLLECTOR, LOOP, SETTINGS, ToyEnv, networks
 
-from egopose.config import compose_config
+from egopose.collection import collectors
+from egopose.collection.collectors import CollectorSettings, build_collector
+from egopose.collection.moments import Moments, merge_states, without_counts
+from egopose.collection.workers import Workers
+from egopose.core.config import compose_config
+from egopose.core.errors import InputError
 from egopose.envs.transforms import StateNormalizer
-from egopose.errors import InputError
-from egopose.training import collectors
-from egopose.training.collectors import CollectorSettings, build_collector
 from egopose.training.loop import LoopSettings, Run, iterate
-from egopose.training.moments import Moments, merge_states, without_counts
 from egopose.training.ppo import PPO, PPOSettings
-from egopose.training.workers import Workers
 
 WORLDS, WORKERS, STEPS = 4, 2, 25
 needs_ray = pytest.mark.skipif(importlib.util.find_spec("ray") is None, reason="needs Ray: pip install 'egopose[ray]'")

@@ -17,12 +17,12 @@ from typing import Any
 import pytest
 from omegaconf import OmegaConf
 
-from egopose.config import compose_config, convert, from_mapping, resolved, run_directory
-from egopose.errors import InputError
-from egopose.training.checkpoint import find_checkpoint, read_json, verify
-from egopose.training.collectors import CollectorSettings
+from egopose.checkpoint.checkpoint import find_checkpoint, read_json, verify
+from egopose.checkpoint.resume import differences
+from egopose.collection.collectors import CollectorSettings
+from egopose.core.config import compose_config, convert, from_mapping, resolved, run_directory
+from egopose.core.errors import InputError
 from egopose.training.ppo import PPOSettings
-from egopose.training.resume import differences
 
 TESTS = Path(__file__).parent
 
@@ -130,8 +130,6 @@ def test_differences_are_named() -> None:
 LAUNCHER = """
 import sys, types
 sys.path.insert(0, {tests!r})
-from egopose.runtime import prepare_runtime
-prepare_runtime()
 from toy_problem import make_run
 stand_in = types.ModuleType("egopose.pipeline")
 from egopose.training.loop import interrupts_held

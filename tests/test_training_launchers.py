@@ -14,13 +14,13 @@ from hydra import compose, initialize_config_dir
 from hydra.utils import instantiate
 from omegaconf import OmegaConf
 
-from egopose.config import config_dir, register_resolvers
+from egopose.core.config import config_dir, register_resolvers
 
 JOB = """
 import json, os, pathlib, sys
 import hydra
 from hydra.core.hydra_config import HydraConfig
-from egopose.config import config_dir, register_resolvers
+from egopose.core.config import config_dir, register_resolvers
 register_resolvers()
 
 @hydra.main(version_base="1.3", config_path=str(config_dir()), config_name="train")

@@ -14,7 +14,7 @@ import torch
 from tensordict import TensorDict
 from toy_problem import SETTINGS, make_env, make_run, networks
 
-from egopose.errors import InputError
+from egopose.core.errors import InputError
 from egopose.training.logging import CsvCurves, ProgressLine, build_loggers, git_state
 from egopose.training.loop import Run, experience_figures, iterate, train
 from egopose.training.ppo import PPO, PPOSettings, TrainingDiverged, _between_neighbours

@@ -16,12 +16,12 @@ from torchrl.render import load_checkpoint
 from toy_problem import COLLECTOR, LOOP, SETTINGS
 
 from egopose import pipeline
+from egopose.checkpoint.checkpoint import compare_states
+from egopose.core.errors import InputError
 from egopose.envs.mdp.observations import humanoid_state
 from egopose.envs.transforms import StateNormalizer, TrackingError, VisualContext
-from egopose.errors import InputError
-from egopose.material import Material
 from egopose.models.feedback import BalanceFeedback
-from egopose.training.checkpoint import compare_states
+from egopose.tasks.dataset import Material
 from egopose.training.loop import train
 
 

@@ -15,19 +15,19 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from egopose.config import compose_config
-from egopose.errors import InputError
+from egopose.core.config import compose_config
+from egopose.core.errors import InputError
 from egopose.evaluation.report import TakeVideo, write_footage, write_motion_files
 from egopose.evaluation.tables import write_columns_csv
 from egopose.humanoid.config import HumanoidConfig
 from egopose.motion.ground_reaction import GroundReaction
 from egopose.motion.kinematics import forward_kinematics
 from egopose.motion.motion import Motion
+from egopose.viewer.auth_proxy import Address, judge
 from egopose.viewer.clip import Footage
-from egopose.viewer.door import Address, judge
+from egopose.viewer.clip_sources import read_columns, read_run, read_runs
 from egopose.viewer.player import Player
-from egopose.viewer.sources import read_columns, read_run, read_runs
-from egopose.viewer.wearer import Pictures
+from egopose.viewer.video_panel import Pictures
 from egopose.vision.video import write_video
 
 FRAMES = 40
@@ -332,7 +332,7 @@ class Gui:
 
 def test_lines_that_change_all_the_time_stay_one_chart() -> None:
     pytest.importorskip("viser", reason="viser is not installed: pip install 'egopose[view]'")
-    from egopose.viewer.curves import Chart
+    from egopose.viewer.charts import Chart
 
     gui = Gui()
     chart: Any = Chart(gui, "V")  # type: ignore[arg-type]
@@ -355,9 +355,9 @@ def test_lines_that_change_all_the_time_stay_one_chart() -> None:
 
 def test_a_stream_is_shown_live() -> None:
     pytest.importorskip("viser", reason="viser is not installed: pip install 'egopose[view]'")
-    from egopose.inference.stream.body import LivePose
     from egopose.inference.stream.broadcast import Broadcast, ServerSettings
-    from egopose.inference.stream.futures import LiveForecast
+    from egopose.inference.stream.live_body import LivePose
+    from egopose.inference.stream.live_forecasts import LiveForecast
     from egopose.inference.stream.messages import forecast_json, frame_json, hello
     from egopose.viewer.live import LiveViewer
 

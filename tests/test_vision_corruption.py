@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 from mocap import default_humanoid
 
-from egopose.config import compose_config
+from egopose.core.config import compose_config
+from egopose.core.errors import InputError
 from egopose.data.preparation import flow_name
-from egopose.errors import InputError
 from egopose.evaluation.tables import write_json
 from egopose.vision.corruption import Corruption
 from egopose.vision.flow import FlowConfig, flow_of_frames

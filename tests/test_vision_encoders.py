@@ -11,7 +11,7 @@ import pytest
 import torch
 from hydra import compose, initialize_config_dir
 
-from egopose.errors import InputError
+from egopose.core.errors import InputError
 from egopose.vision.encoders import FlowEncoder, build_encoder
 from egopose.vision.features import encode
 

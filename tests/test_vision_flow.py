@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from egopose.errors import InputError
+from egopose.core.errors import InputError
 from egopose.vision.features import extract_flow
 from egopose.vision.flow import FlowConfig, flow_image, flow_of_frames, grey_square
 from egopose.vision.video import write_video

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from egopose.errors import InputError
+from egopose.core.errors import InputError
 from egopose.vision.features import extract_flow
 from egopose.vision.flow import FlowConfig, flow_of_frames
 from egopose.vision.lens import Camera, undo_rolling_shutter

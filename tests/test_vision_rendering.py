@@ -15,7 +15,7 @@ import pytest
 from hydra import compose, initialize_config_dir
 from scipy.spatial.transform import Rotation
 
-from egopose.errors import InputError
+from egopose.core.errors import InputError
 from egopose.vision import gl
 from egopose.vision.features import extract_flow
 from egopose.vision.rendering import (

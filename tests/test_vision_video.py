@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from egopose.errors import InputError
+from egopose.core.errors import InputError
 from egopose.vision import video
 from egopose.vision.video import iter_frames, probe_video, read_frames, write_video
 

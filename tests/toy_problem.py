@@ -15,7 +15,7 @@ from torchrl.envs import EnvBase, TransformedEnv
 from torchrl.envs.transforms import StepCounter
 from torchrl.modules import MLP, IndependentNormal, ProbabilisticActor, ValueOperator
 
-from egopose.training.collectors import CollectorSettings, build_collector
+from egopose.collection.collectors import CollectorSettings, build_collector
 from egopose.training.loop import LoopSettings, Run
 from egopose.training.ppo import PPO, PPOSettings
 

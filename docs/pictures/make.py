@@ -14,7 +14,7 @@ import matplotlib
 import mujoco
 import numpy as np
 
-from egopose.config import compose_config
+from egopose.core.config import compose_config
 from egopose.data.gate import LEAD
 from egopose.data.preparation import humanoid_of
 from egopose.data.prepare_motion import reference_motion
@@ -24,11 +24,11 @@ from egopose.humanoid.model import HumanoidModel
 from egopose.humanoid.physics import BatchedPhysics
 from egopose.motion.io import read_motion
 from egopose.motion.motion import Motion
+from egopose.vision.camera_rotation import camera_turning
 from egopose.vision.flow import FlowConfig, flow_image, flow_of_frames
 from egopose.vision.rendering import SceneRenderer, wearer_frames
 from egopose.vision.rooms import room_seed
 from egopose.vision.takes import RenderConfig
-from egopose.vision.turning import camera_turning
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt

@@ -21,11 +21,11 @@ import traceback
 from pathlib import Path
 from typing import Any
 
-from egopose.errors import InputError
+from egopose.core.errors import InputError
 
 HERE = Path(__file__).resolve().parent
 sys.path.insert(0, str(HERE))
-import readers  # noqa: E402
+import readers
 
 SHARES = {
     **{"bvh": 0.2, "acclaim": 0.15, "deepmimic": 0.1, "native": 0.15, "amass": 0.1},

@@ -78,7 +78,7 @@ def read_acclaim(path: Path) -> None:
 
 
 def read_tensors(path: Path) -> None:
-    from egopose.untrusted import check_checkpoint_states, load_tensors
+    from egopose.core.safe_io import check_checkpoint_states, load_tensors
 
     meta, _, state = path.read_bytes().partition(CUT)
     component = path.parent / "checkpoint" / "components" / "0000-policy"
@@ -108,8 +108,8 @@ def read_store(path: Path) -> None:
 
 
 def read_config(path: Path) -> None:
-    from egopose.data.sources import find_sources
-    from egopose.untrusted import read_yaml
+    from egopose.core.safe_io import read_yaml
+    from egopose.data.take_sources import find_sources
 
     for name in ("a.bvh", "a.mp4"):
         (path.parent / name).touch()
@@ -283,9 +283,9 @@ READERS = {
     "deepmimic": Reader(deepmimic_seeds, read_motion_file, ".txt", _MOTION),
     "native": Reader(native_seeds, read_motion_file, ".npz", _MOTION, binary=True),
     "amass": Reader(amass_seeds, read_motion_file, ".npz", _MOTION, binary=True),
-    "tensors": Reader(tensor_seeds, read_tensors, ".two", ("egopose.untrusted",)),
-    "store": Reader(store_seeds, read_store, ".two", ("egopose.untrusted", "egopose.data.store")),
-    "config": Reader(config_seeds, read_config, ".yaml", ("egopose.untrusted", "egopose.data.sources")),
+    "tensors": Reader(tensor_seeds, read_tensors, ".two", ("egopose.core.safe_io",)),
+    "store": Reader(store_seeds, read_store, ".two", ("egopose.core.safe_io", "egopose.data.store")),
+    "config": Reader(config_seeds, read_config, ".yaml", ("egopose.core.safe_io", "egopose.data.take_sources")),
     "video": Reader(video_seeds, read_video, ".mp4", ("egopose.vision.video",), binary=True),
 }
 

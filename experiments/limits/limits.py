@@ -8,35 +8,32 @@ learn and answer from what the limb finder says, and from the truth in its stead
 
 from __future__ import annotations
 
-from egopose.runtime import prepare_runtime
+import argparse
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
 
-prepare_runtime()
+import mujoco
+import numpy as np
+import torch
+from torch import Tensor
 
-import argparse  # noqa: E402
-from collections.abc import Mapping  # noqa: E402
-from pathlib import Path  # noqa: E402
-from typing import Any  # noqa: E402
-
-import mujoco  # noqa: E402
-import numpy as np  # noqa: E402
-import torch  # noqa: E402
-from torch import Tensor  # noqa: E402
-
-from egopose.config import compose_config, from_mapping  # noqa: E402
-from egopose.data.preparation import flow_name, global_spans, humanoid_of, prepare  # noqa: E402
-from egopose.data.splits import split_takes  # noqa: E402
-from egopose.data.store import TakeStore  # noqa: E402
-from egopose.envs.mdp.observations import humanoid_state  # noqa: E402
-from egopose.evaluation.metrics import pose_error  # noqa: E402
-from egopose.files import write_text_whole  # noqa: E402
-from egopose.humanoid.model import HumanoidModel  # noqa: E402
-from egopose.material import absolute_paths  # noqa: E402
-from egopose.models.blended import MeanOfKernels  # noqa: E402
-from egopose.models.mirror import state_mirror  # noqa: E402
-from egopose.models.regressor import state_statistics  # noqa: E402
-from egopose.motion.rotations import Array  # noqa: E402
-from egopose.sight import load_finder_of, seen_in_store  # noqa: E402
-from egopose.training.blending import (  # noqa: E402
+from egopose.core.atomic_write import write_text_whole
+from egopose.core.config import compose_config, from_mapping
+from egopose.data.preparation import flow_name, global_spans, humanoid_of, prepare
+from egopose.data.spans import Span, cross_fit_blocks, without_block
+from egopose.data.splits import split_takes
+from egopose.data.store import TakeStore
+from egopose.envs.mdp.observations import humanoid_state
+from egopose.evaluation.metrics import pose_error
+from egopose.humanoid.model import HumanoidModel
+from egopose.models.blended import MeanOfKernels
+from egopose.models.mirror import state_mirror
+from egopose.models.regressor import state_statistics
+from egopose.motion.rotations import Array
+from egopose.pipeline.dataset import absolute_paths
+from egopose.pipeline.regressor_input import load_finder_of, seen_in_store
+from egopose.training.blended_regressor import (
     KernelSettings,
     fit_kernels,
     importance_of,
@@ -44,11 +41,10 @@ from egopose.training.blending import (  # noqa: E402
     view_table,
     windowed,
 )
-from egopose.training.fragments import Span, cross_fit_blocks, without_block  # noqa: E402
-from egopose.vision.limb_pictures import BODIES, posture_in  # noqa: E402
-from egopose.vision.limbs import LOG_VARIANCE, LimbFinder  # noqa: E402
-from egopose.vision.rendering import WEARER_CAMERA, camera_orientations, worn_camera  # noqa: E402
-from egopose.vision.takes import RenderConfig, take_seed  # noqa: E402
+from egopose.vision.body_part_pictures import BODIES, posture_in
+from egopose.vision.body_parts import LOG_VARIANCE, LimbFinder
+from egopose.vision.rendering import WEARER_CAMERA, camera_orientations, worn_camera
+from egopose.vision.takes import RenderConfig, take_seed
 
 HERE = Path(__file__).resolve().parent
 SUBJECTS = ("2", "5", "7")

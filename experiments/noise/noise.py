@@ -10,33 +10,29 @@ To train on corrupted video: `egopose train ... corruption=jitter`.
 
 from __future__ import annotations
 
-from egopose.runtime import prepare_runtime
+import argparse
+import json
+import os
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
 
-prepare_runtime()
-
-import argparse  # noqa: E402
-import json  # noqa: E402
-import os  # noqa: E402
-import sys  # noqa: E402
-from collections.abc import Mapping, Sequence  # noqa: E402
-from pathlib import Path  # noqa: E402
-from typing import Any  # noqa: E402
-
-from egopose.baselines import load_baseline, path_pose_motion, score_motions  # noqa: E402
-from egopose.config import compose_config, from_mapping  # noqa: E402
-from egopose.data.preparation import flow_name, store_folder  # noqa: E402
-from egopose.data.store import TakeStore  # noqa: E402
-from egopose.errors import InputError  # noqa: E402
-from egopose.evaluation.agents import evaluate_agent  # noqa: E402
-from egopose.evaluation.protocols import ContactSettings, fragment_names, raw_figures  # noqa: E402
-from egopose.evaluation.tables import write_json  # noqa: E402
-from egopose.inference.failsafe import FailSafeSettings  # noqa: E402
-from egopose.inference.planner_settings import planner_settings  # noqa: E402
-from egopose.material import run_material  # noqa: E402
-from egopose.models.baselines.path_pose import PathPose  # noqa: E402
-from egopose.pipeline import load_agent  # noqa: E402
-from egopose.untrusted import read_yaml  # noqa: E402
-from egopose.vision.corruption import Corruption  # noqa: E402
+from egopose.core.config import compose_config, from_mapping
+from egopose.core.errors import InputError
+from egopose.core.safe_io import read_yaml
+from egopose.data.preparation import flow_name, store_folder
+from egopose.data.store import TakeStore
+from egopose.evaluation.agents import evaluate_agent
+from egopose.evaluation.protocols import ContactSettings, fragment_names, raw_figures
+from egopose.evaluation.tables import write_json
+from egopose.inference.failsafe import FailSafeSettings
+from egopose.inference.planner_settings import planner_settings
+from egopose.models.baselines.path_pose import PathPose
+from egopose.pipeline.agent import load_agent
+from egopose.pipeline.baselines import load_baseline, path_pose_motion, score_motions
+from egopose.pipeline.dataset import run_material
+from egopose.vision.corruption import Corruption
 
 HERE = Path(__file__).resolve().parent
 CORRUPTIONS = ("none", "jitter", "drift", "shake", "dropped", "all")

@@ -18,11 +18,11 @@ from typing import Any
 
 import numpy as np
 
-from egopose.errors import InputError
+from egopose.core.errors import InputError
+from egopose.core.safe_io import read_json
 from egopose.evaluation.report import RENDERED_NOTE
 from egopose.evaluation.statistics import ratio_interval
 from egopose.motion.rotations import Array
-from egopose.untrusted import read_json
 
 HERE = Path(__file__).resolve().parent
 CLEAN = "none"

@@ -8,29 +8,25 @@ that are there are not run again. README.md is written from raw/.
 
 from __future__ import annotations
 
-from egopose.runtime import prepare_runtime
+import argparse
+import fnmatch
+import json
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
 
-prepare_runtime()
+import numpy as np
 
-import argparse  # noqa: E402
-import fnmatch  # noqa: E402
-import json  # noqa: E402
-from collections.abc import Sequence  # noqa: E402
-from dataclasses import replace  # noqa: E402
-from pathlib import Path  # noqa: E402
-from typing import Any  # noqa: E402
-
-import numpy as np  # noqa: E402
-
-from egopose.config import compose_config, from_mapping  # noqa: E402
-from egopose.envs.starts import FragmentLike  # noqa: E402
-from egopose.evaluation.agents import FragmentResult, evaluate_agent  # noqa: E402
-from egopose.evaluation.protocols import ContactSettings  # noqa: E402
-from egopose.files import write_text_whole  # noqa: E402
-from egopose.inference.failsafe import FailSafeSettings  # noqa: E402
-from egopose.inference.planner_settings import planner_settings  # noqa: E402
-from egopose.pipeline import Agent, load_agent  # noqa: E402
-from egopose.untrusted import read_yaml  # noqa: E402
+from egopose.core.atomic_write import write_text_whole
+from egopose.core.config import compose_config, from_mapping
+from egopose.core.safe_io import read_yaml
+from egopose.envs.starts import FragmentLike
+from egopose.evaluation.agents import FragmentResult, evaluate_agent
+from egopose.evaluation.protocols import ContactSettings
+from egopose.inference.failsafe import FailSafeSettings
+from egopose.inference.planner_settings import planner_settings
+from egopose.pipeline.agent import Agent, load_agent
 
 HERE = Path(__file__).resolve().parent
 SHORTEST = 90  # frames of a take

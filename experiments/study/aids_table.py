@@ -17,10 +17,10 @@ from typing import Any
 
 import numpy as np
 
-from egopose.errors import InputError
+from egopose.core.errors import InputError
+from egopose.core.safe_io import read_json
 from egopose.evaluation.statistics import Interval, mean_interval
 from egopose.motion.rotations import Array
-from egopose.untrusted import read_json
 
 HERE = Path(__file__).resolve().parent
 TABLE = "table4_training_aids"

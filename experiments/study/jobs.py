@@ -13,30 +13,32 @@ import torch
 from study import Job
 
 from egopose.baseline import run_baseline_job
-from egopose.baselines import forecast_qpos, load_baseline, path_pose_motion, regressed_motion, score_motions
-from egopose.config import compose_config, from_mapping
+from egopose.core.config import compose_config, from_mapping
 from egopose.data.preparation import flow_name, store_folder
 from egopose.data.store import TakeStore
+from egopose.data.windows import ForecastWindow, forecast_windows
 from egopose.evaluation.agents import evaluate_agent
-from egopose.evaluation.forecasting import ForecastWindow, forecast_windows, score_forecasts, true_futures
+from egopose.evaluation.forecast_metrics import score_forecasts, true_futures
+from egopose.evaluation.forecast_run import ForecastSettings, forecast_windows_of, windows_of
 from egopose.evaluation.protocols import ContactSettings, fragment_names, raw_figures
-from egopose.evaluation.survival import base_tracking, frames_survived, reference_tracking
 from egopose.evaluation.tables import write_json
-from egopose.forecast_contexts import past_states
-from egopose.forecast_evaluation import ForecastSettings, forecast_windows_of, windows_of
 from egopose.inference.context_states import context_states
 from egopose.inference.failsafe import FailSafeSettings
+from egopose.inference.forecast_contexts import past_states
 from egopose.inference.planner_settings import planner_settings
-from egopose.material import Material, absolute_paths, load_material, run_material
 from egopose.models.baselines.path_pose import PathPose
 from egopose.models.baselines.recurrent import RecurrentForecaster
 from egopose.motion.rotations import Array
-from egopose.motion_forecasts import begin_forecasts
-from egopose.pipeline import Agent, load_agent
-from egopose.regression import load_regressor
-from egopose.sight import seen_in_store
-from egopose.train import run_job as train_job
+from egopose.pipeline.agent import Agent, load_agent
+from egopose.pipeline.baselines import forecast_qpos, load_baseline, path_pose_motion, regressed_motion, score_motions
+from egopose.pipeline.dataset import absolute_paths, load_material, run_material
+from egopose.pipeline.forecaster import begin_forecasts
+from egopose.pipeline.regressor import load_regressor
+from egopose.pipeline.regressor_input import seen_in_store
+from egopose.pipeline.training import run_job as train_job
+from egopose.tasks.dataset import Material
 from egopose.training.logging import write_provenance
+from egopose.training.survival import base_tracking, frames_survived, reference_tracking
 
 Result = dict[str, Any]
 
@@ -142,7 +144,7 @@ def _estimates(
 def _survival(agent: Agent, settings: dict[str, Any]) -> dict[str, list[int]]:
     """Frames to a fall of each episode on the training takes, from the same uniform starts whoever acts.
 
-    ``policy``: its mean action. The others need no training, see :mod:`egopose.evaluation.survival`.
+    ``policy``: its mean action. The others need no training, see :mod:`egopose.training.survival`.
     """
     env = agent.make_env("train", worlds=int(settings["survival"]["worlds"]), threads=int(settings["threads"]))
     acting = {"policy": agent.actor, "base_tracking": base_tracking(env), "reference_tracking": reference_tracking(env)}

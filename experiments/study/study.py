@@ -9,26 +9,22 @@ experiments/TABLE/raw. After Ctrl-C, --hours or a kill, the same command goes on
 
 from __future__ import annotations
 
-from egopose.runtime import prepare_runtime
+import argparse
+import fnmatch
+import hashlib
+import json
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
 
-prepare_runtime()
-
-import argparse  # noqa: E402
-import fnmatch  # noqa: E402
-import hashlib  # noqa: E402
-import json  # noqa: E402
-import signal  # noqa: E402
-import subprocess  # noqa: E402
-import sys  # noqa: E402
-import time  # noqa: E402
-from collections.abc import Callable, Mapping, Sequence  # noqa: E402
-from dataclasses import asdict, dataclass  # noqa: E402
-from pathlib import Path  # noqa: E402
-from typing import Any  # noqa: E402
-
-from egopose.errors import InputError  # noqa: E402
-from egopose.training.resume import only_process  # noqa: E402
-from egopose.untrusted import read_yaml  # noqa: E402
+from egopose.checkpoint.resume import only_process
+from egopose.core.errors import InputError
+from egopose.core.safe_io import read_yaml
 
 HERE = Path(__file__).resolve().parent
 INTERRUPTED = 130

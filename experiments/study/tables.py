@@ -18,12 +18,12 @@ from typing import Any
 
 import numpy as np
 
-from egopose.errors import InputError
+from egopose.core.errors import InputError
+from egopose.core.safe_io import read_json
 from egopose.evaluation.report import RENDERED_NOTE
 from egopose.evaluation.statistics import Interval, mean_interval, ratio_interval
 from egopose.evaluation.tables import write_json
 from egopose.motion.rotations import Array
-from egopose.untrusted import read_json
 
 HERE = Path(__file__).resolve().parent
 ESTIMATION, ABLATIONS, HORIZONS = "table1_estimation", "table2_ablations", "table3_horizons"

@@ -5,4 +5,9 @@ lead. *Heading* of a quaternion: keep (w, z), zero (x, y), renormalise. *Heading
 root's heading.
 """
 
+from egopose.core.runtime import prepare_runtime
+
 __version__ = "0.1.0"
+
+# Before anything imports torch: its OpenMP threads read these settings when they start.
+prepare_runtime()

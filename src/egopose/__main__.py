@@ -7,24 +7,7 @@ import importlib
 import sys
 from importlib.metadata import version
 
-VERBS = {
-    "demo": "train a policy on the default data, evaluate it, show a table and a video",
-    "prepare": "turn motion files and videos into a store: retarget, render or decode, flow, features",
-    "sync": "find the offset between a video and a motion, by how the head turns in both",
-    "train": "train a policy (Hydra: group=choice key=value, --multirun)",
-    "baseline": "train a method that policies are compared with: ERD, acLSTM, PathPose",
-    "limbs": "train what finds the wearer's limbs in the picture, on pictures it draws",
-    "evaluate": "score a checkpoint on held-out takes beside PoseReg: tables, CSV, BVH, side-by-side MP4",
-    "kappa": "choose the fail-safe's threshold for a run on its training takes",
-    "estimate": "motion from a video alone: BVH and MP4",
-    "export": "motions for other programs: BVH, GLB, AMASS npz, TRC, C3D, OpenSim, CSV",
-    "view": "look at motions, estimates and forecasts in the browser",
-    "ship": "a trained run as a small folder to be given away: no optimisers, no paths of this machine",
-    "report": "one HTML page of an evaluation or a sweep: tables, curves, pictures",
-    "stream": "motion live from a camera, a video or an address: WebSocket, file, latencies",
-    "bench": "measure the environment's and the pipeline's speed",
-    "completion": "print the script that completes verbs and settings in bash or zsh",
-}
+from egopose.core.verbs import FORMER, VERBS
 
 
 def usage() -> str:
@@ -44,14 +27,15 @@ def main() -> None:
     if arguments[0] == "--version":
         print(f"egopose {version('egopose')}")
         raise SystemExit(0)
-    verb = arguments[0]
+    verb = FORMER.get(arguments[0], arguments[0])
     if verb not in VERBS:
         near = difflib.get_close_matches(verb, VERBS, 1)
         meant = f"; did you mean {near[0]}?" if near else ""
         print(f"error: no verb {verb!r}{meant}\n\n{usage()}", file=sys.stderr)
         raise SystemExit(2)
     sys.argv = [f"egopose {verb}", *arguments[1:]]
-    importlib.import_module(f"egopose.{verb}").main()
+    module = "core.completion" if verb == "completion" else verb
+    importlib.import_module(f"egopose.{module}").main()
 
 
 if __name__ == "__main__":

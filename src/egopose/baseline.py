@@ -2,19 +2,15 @@
 
 from __future__ import annotations
 
-from egopose.runtime import prepare_runtime
+import sys
+from pathlib import Path
+from typing import Any
 
-prepare_runtime()
+from hydra.core.hydra_config import HydraConfig
+from omegaconf import DictConfig
 
-import sys  # noqa: E402
-from pathlib import Path  # noqa: E402
-from typing import Any  # noqa: E402
-
-from hydra.core.hydra_config import HydraConfig  # noqa: E402
-from omegaconf import DictConfig  # noqa: E402
-
-from egopose.config import command, register_resolvers, resolved  # noqa: E402
-from egopose.errors import InputError  # noqa: E402
+from egopose.core.config import command, register_resolvers, resolved
+from egopose.core.errors import InputError
 
 register_resolvers()
 
@@ -23,11 +19,11 @@ def run_baseline_job(config: dict[str, Any], folder: Path) -> None:
     """Train in ``folder`` as far as that is still to be done: from its last checkpoint, or not at all.
 
     Raises:
-        InputError: as :func:`egopose.baselines.run_baseline`; the directory is that of another job.
+        InputError: as :func:`egopose.pipeline.baselines.run_baseline`; the directory is that of another job.
     """
-    from egopose.baselines import run_baseline
+    from egopose.checkpoint.resume import continued_job, finished
+    from egopose.pipeline.baselines import run_baseline
     from egopose.training.logging import write_provenance
-    from egopose.training.resume import continued_job, finished
 
     checkpoint = continued_job(folder, config)
     if (done := finished(folder, config)) is not None:
@@ -48,8 +44,8 @@ def run_baseline_job(config: dict[str, Any], folder: Path) -> None:
 @command("baseline")
 def main(config: DictConfig) -> None:
     """Hydra's entry."""
-    from egopose.material import absolute_paths
-    from egopose.training.resume import only_process, resumed_config
+    from egopose.checkpoint.resume import only_process, resumed_config
+    from egopose.pipeline.dataset import absolute_paths
 
     state = HydraConfig.get()
     folder = Path(state.runtime.output_dir if config.resume is None else config.resume).resolve()

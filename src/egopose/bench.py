@@ -13,31 +13,14 @@ export: what every export format loses, by independent readers.
 
 from __future__ import annotations
 
-from egopose.runtime import prepare_runtime
+import argparse
+import json
+import sys
+from collections.abc import Sequence
+from importlib import import_module
 
-prepare_runtime()
-
-import argparse  # noqa: E402
-import json  # noqa: E402
-import sys  # noqa: E402
-from collections.abc import Sequence  # noqa: E402
-from importlib import import_module  # noqa: E402
-
-from egopose.errors import InputError  # noqa: E402
-
-#: Verbs and how many rounds each takes unless told; a verb's module is ``egopose.benchmarks.<verb>``.
-VERBS = {
-    "env": 9,
-    "update": 5,
-    "resume": 50,
-    "features": 9,
-    "scaling": 5,
-    "rates": 3,
-    "export": 1,
-    "sync": 8,
-    "stream": 1,
-    "plan": 9,
-}
+from egopose.core.errors import InputError
+from egopose.core.verbs import BENCHMARKS
 
 
 def command_line() -> argparse.ArgumentParser:
@@ -45,7 +28,7 @@ def command_line() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="egopose bench", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("verb", choices=list(VERBS))
+    parser.add_argument("verb", choices=list(BENCHMARKS))
     parser.add_argument("overrides", nargs="*", metavar="key=value", help="of the training configuration")
     parser.add_argument("--json", action="store_true", help="one JSON object on standard output")
     parser.add_argument("--rounds", type=int, help="how often: rounds, or kills (resume), or lengths (stream)")
@@ -57,7 +40,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     options = command_line().parse_intermixed_args(arguments)
     verb = import_module(f"egopose.benchmarks.{options.verb}")
     try:
-        result = verb.run(options.overrides, VERBS[options.verb] if options.rounds is None else options.rounds)
+        result = verb.run(options.overrides, BENCHMARKS[options.verb] if options.rounds is None else options.rounds)
     except InputError as error:
         print(f"error: {error}", file=sys.stderr)
         raise SystemExit(2) from None

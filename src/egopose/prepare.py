@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-from egopose.runtime import prepare_runtime
+import sys
 
-prepare_runtime()
+from omegaconf import DictConfig
 
-import sys  # noqa: E402
-
-from omegaconf import DictConfig  # noqa: E402
-
-from egopose.config import command, register_resolvers, resolved  # noqa: E402
-from egopose.errors import InputError  # noqa: E402
+from egopose.core.config import command, register_resolvers, resolved
+from egopose.core.errors import InputError
 
 register_resolvers()
 

@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-from egopose.runtime import prepare_runtime
+import sys
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
 
-prepare_runtime()
+from omegaconf import DictConfig
 
-import sys  # noqa: E402
-from collections.abc import Mapping  # noqa: E402
-from typing import TYPE_CHECKING, Any  # noqa: E402
-
-from omegaconf import DictConfig  # noqa: E402
-
-from egopose.config import command, resolved  # noqa: E402
-from egopose.errors import InputError  # noqa: E402
+from egopose.core.config import command, resolved
+from egopose.core.errors import InputError
 
 if TYPE_CHECKING:
     from egopose.data.sync import Sync

@@ -7,21 +7,17 @@ Words key=value are overrides of conf/sync.yaml (the camera), for `--offset auto
 
 from __future__ import annotations
 
-from egopose.runtime import prepare_runtime
+import argparse
+import secrets
+import signal
+import sys
+import threading
+from collections.abc import Sequence
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING
 
-prepare_runtime()
-
-import argparse  # noqa: E402
-import secrets  # noqa: E402
-import signal  # noqa: E402
-import sys  # noqa: E402
-import threading  # noqa: E402
-from collections.abc import Sequence  # noqa: E402
-from importlib.util import find_spec  # noqa: E402
-from pathlib import Path  # noqa: E402
-from typing import TYPE_CHECKING  # noqa: E402
-
-from egopose.errors import InputError  # noqa: E402
+from egopose.core.errors import InputError
 
 if TYPE_CHECKING:
     from egopose.viewer.live import LiveViewer
@@ -65,9 +61,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
         if find_spec("viser") is None:
             raise InputError("view", "viser", "is not installed; pip install 'egopose[view]'")
         from egopose.viewer.app import Viewer
+        from egopose.viewer.auth_proxy import Address
         from egopose.viewer.clip import Footage
-        from egopose.viewer.door import Address
-        from egopose.viewer.sources import read_runs
+        from egopose.viewer.clip_sources import read_runs
         from egopose.vision.video import probe_video
 
         overrides = [word for word in options.sources if "=" in word and not _is_source(word)]

@@ -5,6 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+from egopose import pipeline
+from egopose.benchmarks.raw_replay import compare_with_raw
+from egopose.collection.collectors import CollectorSettings, base_env, build_collector, set_threads
+from egopose.core.runtime import settle_heap
+
 
 def run(overrides: Sequence[str], rounds: int) -> dict[str, Any]:
     """The full collection loop beside raw ``mj_step`` of the same model, substeps, threads and states.
@@ -17,15 +22,11 @@ def run(overrides: Sequence[str], rounds: int) -> dict[str, Any]:
         rounds: interleaved; the median counts.
 
     Returns:
-        See :func:`egopose.envs.benchmark.compare_with_raw`.
+        See :func:`egopose.benchmarks.raw_replay.compare_with_raw`.
 
     Raises:
         InputError: a setting is unknown or out of range.
     """
-    from egopose import pipeline
-    from egopose.envs.benchmark import compare_with_raw
-    from egopose.runtime import settle_heap
-    from egopose.training.collectors import CollectorSettings, base_env, build_collector, set_threads
 
     config = pipeline.compose_config("train", ["sim=paper", *overrides])
     material = pipeline.motion_material(config)

@@ -15,11 +15,13 @@ import numpy as np
 
 import egopose
 from egopose.benchmarks.read_back import ReadBack, readers
-from egopose.config import compose_config, from_mapping
-from egopose.errors import InputError
+from egopose.core.config import compose_config, from_mapping
+from egopose.core.errors import InputError
+from egopose.data.preparation import humanoid_of
+from egopose.data.prepare_motion import reference_motion
 from egopose.humanoid.inverse_dynamics import ForceSettings, with_forces
 from egopose.humanoid.model import HumanoidModel
-from egopose.motion.io import write_motion
+from egopose.motion.io import read_motion, write_motion
 from egopose.motion.io.amass import rest_positions
 from egopose.motion.motion import Motion
 from egopose.motion.rotations import Array
@@ -41,9 +43,6 @@ def run(overrides: Sequence[str], rounds: int) -> dict[str, Any]:
     Raises:
         InputError: an override is wrong, or a reading package is missing.
     """
-    from egopose.data.preparation import humanoid_of
-    from egopose.data.prepare_motion import reference_motion
-    from egopose.motion.io import read_motion
 
     settings = dict(compose_config("export")["forces"])
     humanoid = humanoid_of(compose_config("train", list(overrides)))

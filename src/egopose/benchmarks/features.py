@@ -11,8 +11,14 @@ from typing import Any
 
 import cv2
 import numpy as np
+import torch
 
-from egopose.errors import InputError
+from egopose.core.config import compose_config
+from egopose.core.errors import InputError
+from egopose.vision.encoders import build_encoder
+from egopose.vision.features import encode, extract_flow
+from egopose.vision.flow import FlowConfig
+from egopose.vision.video import VideoWriter
 
 _FRAMES = 600  # 20 s at 30 Hz: starting the threads no longer weighs
 
@@ -36,12 +42,6 @@ def run(overrides: Sequence[str], rounds: int) -> dict[str, Any]:
     Raises:
         InputError: a setting is unknown or out of range.
     """
-    import torch
-
-    from egopose.config import compose_config
-    from egopose.vision.encoders import build_encoder
-    from egopose.vision.features import encode, extract_flow
-    from egopose.vision.flow import FlowConfig
 
     config = compose_config("train", overrides)
     vision = config["vision"]
@@ -81,7 +81,6 @@ def run(overrides: Sequence[str], rounds: int) -> dict[str, Any]:
 
 def write_pan(path: Path, size: int, frames: int, fps: float) -> None:
     """A video ``[frames, size, size]`` of a camera that pans and rolls over a plane of blurred noise."""
-    from egopose.vision.video import VideoWriter
 
     generator = np.random.default_rng(0)
     noise = generator.integers(0, 256, (4 * size, 4 * size, 3), dtype=np.uint8)

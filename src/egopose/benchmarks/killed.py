@@ -7,11 +7,21 @@ import json
 import mmap
 import multiprocessing.forkserver
 import os
+import shutil
 import struct
 import sys
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
+
+import torch
+
+from egopose import pipeline
+from egopose.checkpoint.checkpoint import read_json
+from egopose.collection.collectors import transform_state
+from egopose.collection.workers import Workers
+from egopose.pipeline.training import run_job
+from egopose.training import loop
 
 #: What a training is doing; ``load`` is taking over a checkpoint.
 PHASES = ("start", "load", "collect", "update", "save")
@@ -53,8 +63,6 @@ class Notes:
 
 def train_or_go_on(config: dict[str, Any], folder: Path, number: int) -> None:
     """What the killed process does: the job of a sweep in ``folder``, from its beginning or its last checkpoint."""
-    from egopose import pipeline
-    from egopose.train import run_job
 
     with folder.with_suffix(".log").open("a") as log:
         for stream in (sys.stdout, sys.stderr):
@@ -69,7 +77,6 @@ def train_or_go_on(config: dict[str, Any], folder: Path, number: int) -> None:
 
 def _observe(notes: Notes, number: int) -> None:
     """Have training's functions note where they are, and compare what is loaded with its checkpoint."""
-    from egopose.training import loop
 
     def before(owner: Any, name: str, phase: str) -> None:
         function = getattr(owner, name)
@@ -109,10 +116,6 @@ def loaded_otherwise(run: Any, checkpoint: Path) -> list[str]:
     What it holds is saved once more, worlds and random numbers as its workers themselves tell them, and compared file
     by file; the parameters and the normaliser's statistics of every worker with the learner's.
     """
-    import shutil
-
-    from egopose.training.collectors import transform_state
-    from egopose.training.workers import Workers
 
     collector, differs = run.collector, []
     if isinstance(collector, Workers):
@@ -130,7 +133,6 @@ def loaded_otherwise(run: Any, checkpoint: Path) -> list[str]:
 
 def unequal(first: Mapping[str, Any], second: Mapping[str, Any]) -> list[str]:
     """Keys whose values differ, or that one lacks."""
-    import torch
 
     def same(a: Any, b: Any) -> bool:
         return torch.equal(a, b) if isinstance(a, torch.Tensor) and isinstance(b, torch.Tensor) else bool(a == b)
@@ -154,6 +156,5 @@ def content(checkpoint: Path) -> dict[str, bytes | dict[str, Any]]:
 
 def trainer_state(checkpoint: Path) -> dict[str, Any]:
     """A checkpoint's counters but for the clock."""
-    from egopose.training.checkpoint import read_json
 
     return {key: value for key, value in read_json(checkpoint, "trainer_state").items() if key != "seconds"}

@@ -7,6 +7,15 @@ import time
 from collections.abc import Sequence
 from typing import Any
 
+import torch
+
+from egopose import pipeline
+from egopose.benchmarks.raw_replay import RawReplay, StepRecorder
+from egopose.envs.mdp.observations import humanoid_state
+from egopose.inference.estimator import prepare_for_test
+from egopose.inference.planner import Planner
+from egopose.inference.planner_settings import planner_settings
+
 
 def run(overrides: Sequence[str], rounds: int) -> dict[str, Any]:
     """Plans of ``conf/planner/ahead.yaml`` for one body, then the same control steps by ``mj_step`` alone.
@@ -25,14 +34,6 @@ def run(overrides: Sequence[str], rounds: int) -> dict[str, Any]:
     Raises:
         InputError: a setting is unknown or out of range, or is for no planner.
     """
-    import torch
-
-    from egopose import pipeline
-    from egopose.envs.benchmark import RawReplay, StepRecorder
-    from egopose.envs.mdp.observations import humanoid_state
-    from egopose.inference.estimator import prepare_for_test
-    from egopose.inference.planner_settings import planner_settings
-    from egopose.inference.planning import Planner
 
     ours = [word for word in overrides if word.startswith("planner.")]
     config = pipeline.compose_config("train", ["sim=fast", *(word for word in overrides if word not in ours)])

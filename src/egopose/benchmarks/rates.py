@@ -5,6 +5,18 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+import numpy as np
+
+from egopose.core.config import compose_config
+from egopose.data.gate import feasible_starts
+from egopose.data.prepare_motion import PreparationSettings, reference_motion
+from egopose.data.rates import Starts, compare_rates
+from egopose.data.take_sources import find_sources
+from egopose.humanoid.config import HumanoidConfig, SimConfig
+from egopose.humanoid.model import build_humanoid
+from egopose.motion.io import read_motion
+from egopose.motion.motion import finite_difference
+
 #: Physics steps a control step that are compared; the first is the measure of the others.
 SUBSTEPS = (15, 8, 5, 4, 3, 2)
 
@@ -22,17 +34,6 @@ def run(overrides: Sequence[str], rounds: int) -> dict[str, Any]:
     Raises:
         InputError: a setting is unknown, or the data cannot be used.
     """
-    import numpy as np
-
-    from egopose.config import compose_config
-    from egopose.data.gate import feasible_starts
-    from egopose.data.prepare_motion import PreparationSettings, reference_motion
-    from egopose.data.rates import Starts, compare_rates
-    from egopose.data.sources import find_sources
-    from egopose.humanoid.config import HumanoidConfig, SimConfig
-    from egopose.humanoid.model import build_humanoid
-    from egopose.motion.io import read_motion
-    from egopose.motion.motion import finite_difference
 
     config = compose_config("prepare", list(overrides))
     table = HumanoidConfig.from_mapping(config["humanoid"])

@@ -16,9 +16,12 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
+from egopose import pipeline
 from egopose.benchmarks import processes
 from egopose.benchmarks.killed import LOADED, NOTES, PHASES, Notes, content, train_or_go_on, trainer_state, unequal
-from egopose.errors import InputError
+from egopose.checkpoint.checkpoint import FOLDER, find_checkpoint
+from egopose.core.errors import InputError
+from egopose.training.logging import CURVES
 
 #: A whole training made small: what is lost or altered by a kill does not depend on the size.
 SMALL = (
@@ -71,8 +74,6 @@ def run(overrides: Sequence[str], rounds: int) -> dict[str, Any]:
         InputError: a setting is unknown or out of range.
         RuntimeError: a training ended by itself with an error; says which.
     """
-    from egopose import pipeline
-    from egopose.training.checkpoint import find_checkpoint
 
     if rounds < 1:
         raise InputError("bench resume", "rounds", f"must be at least 1, not {rounds}")
@@ -147,7 +148,6 @@ class _Campaign:
 
     def kill(self) -> None:
         """Start it, kill it at a random moment, and wait for all its processes to end."""
-        from egopose.training.checkpoint import FOLDER, find_checkpoint
 
         self._notes.clear()
         others = processes.family(os.getpid())
@@ -223,7 +223,6 @@ def _finish(process: Any, folder: Path) -> None:
 
 
 def _curves(folder: Path) -> list[dict[str, Any]]:
-    from egopose.training.logging import CURVES
 
     with (folder / CURVES).open(newline="") as stream:
         return [{key: value for key, value in row.items() if key not in _TIMES} for row in csv.DictReader(stream)]

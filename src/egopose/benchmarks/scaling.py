@@ -23,7 +23,10 @@ import torch
 from tensordict import MemoryMappedTensor, TensorDictBase
 from torchrl.envs import EnvBase
 
+from egopose import pipeline
 from egopose.benchmarks.process_memory import mapped_mb, private_mb, proportional_mb
+from egopose.collection.collectors import CollectorSettings, base_env, build_collector, set_threads
+from egopose.training.ppo import PPO, PPOSettings
 
 _WORLDS = (8, 32, 64)  # batch sizes between which the Python part's fixed and growing costs are told apart
 _STEPS = 48  # batched steps a measurement of collection
@@ -57,9 +60,6 @@ def run(overrides: Sequence[str], rounds: int) -> dict[str, Any]:
     Raises:
         InputError: a setting is unknown or out of range.
     """
-    from egopose import pipeline
-    from egopose.training.collectors import CollectorSettings, set_threads
-    from egopose.training.ppo import PPO, PPOSettings
 
     config = pipeline.compose_config("train", ["collector=multi_sync", "collector.update_threads=1", *overrides])
     material = pipeline.motion_material(config)
@@ -100,7 +100,6 @@ def run(overrides: Sequence[str], rounds: int) -> dict[str, Any]:
 
 
 def _make_env(config: Mapping[str, Any], material: Any, worlds: int, number: int) -> EnvBase:
-    from egopose import pipeline
 
     # Every row is read, as in hours of training.
     float(material.visual_context.sum())
@@ -142,7 +141,6 @@ def _times(act: Callable[[], Any], repeats: int, clock: Callable[[], float]) -> 
 
 def _collection(make_env: Callable[[int, int], EnvBase], actor: Any) -> dict[str, float]:
     """Physics, Python and policy in this process with one thread, at several batch sizes."""
-    from egopose.training.collectors import base_env, build_collector
 
     physics, python, policy = {}, {}, {}
     for worlds in _WORLDS:
@@ -183,13 +181,11 @@ def _collection(make_env: Callable[[int, int], EnvBase], actor: Any) -> dict[str
 
 
 def _sync(worlds: int) -> Any:
-    from egopose.training.collectors import CollectorSettings
 
     return CollectorSettings("sync", worlds, 1, 1, 1, 1)
 
 
 def _batch(make_env: Callable[[int, int], EnvBase], actor: Any, steps: int, worlds: int) -> TensorDictBase:
-    from egopose.training.collectors import build_collector
 
     collector = build_collector(_sync(worlds), lambda number: make_env(worlds, number), actor, steps)
     try:
@@ -224,7 +220,6 @@ def _workers(
     count: int, settings: Any, make_env: Any, ppo: Any, file: Path, known: Mapping[str, Any], rounds: int
 ) -> dict[str, float]:
     """Memory of so many workers, what it costs to speak to them, and whole iterations where each has a core."""
-    from egopose.training.collectors import build_collector
 
     steps = int(known["steps_per_iteration"])
     pool = build_collector(settings, partial(make_env, settings.worlds), ppo.actor, steps)
@@ -255,7 +250,6 @@ def _workers(
 def _whole_iterations(
     name: str, settings: Any, make_env: Any, ppo: Any, known: Mapping[str, Any], rounds: int
 ) -> dict[str, float]:
-    from egopose.training.collectors import build_collector
 
     steps = int(known["steps_per_iteration"])
     collector = build_collector(settings, partial(make_env, settings.worlds), ppo.actor, steps)
@@ -269,7 +263,6 @@ def _whole_iterations(
 
 def _rate(name: str, collector: Any, batches: Any, ppo: Any, settings: Any, rounds: int) -> dict[str, float]:
     """Control steps/s of iterations as training takes them; ``name`` is the kind and the workers."""
-    from egopose.training.collectors import set_threads
 
     pids = [process.pid for process in getattr(getattr(collector, "_collector", None), "procs", ())]
     frames = 0

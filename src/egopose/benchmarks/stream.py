@@ -9,15 +9,35 @@ import threading
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from egopose.errors import InputError
+import torch
+from torch import Tensor
 
-if TYPE_CHECKING:
-    from torch import Tensor
-
-    from egopose.humanoid.model import HumanoidModel
-    from egopose.stream import Forecaster, Trained
+from egopose.core.config import compose_config, from_mapping
+from egopose.core.errors import InputError
+from egopose.data.preparation import humanoid_of, prepare
+from egopose.data.spans import Span
+from egopose.envs.mdp.observations import humanoid_state
+from egopose.humanoid.model import HumanoidModel
+from egopose.inference.stream.build import (
+    Forecaster,
+    Trained,
+    build_loop,
+    forecast_settings,
+    load_forecaster,
+    load_trained,
+    settle_memory,
+    source_settings,
+    still_frames,
+)
+from egopose.inference.stream.outputs import open_outputs
+from egopose.models.regressor_settings import RegressorSettings
+from egopose.pipeline.environment import build_env
+from egopose.pipeline.networks import build_networks
+from egopose.pipeline.regressor_input import planes_of
+from egopose.training.regressor import build_regressor
+from egopose.vision.encoders import build_encoder
 
 _PREFIX = "stream."
 _SECONDS = 20.0  # of a round, unless told: 600 frames, of which six are beyond the 99th percentile
@@ -50,8 +70,6 @@ def run(overrides: Sequence[str], rounds: int) -> dict[str, Any]:
     Raises:
         InputError: a setting is unknown or out of range, the source cannot be read.
     """
-    from egopose.config import compose_config
-    from egopose.stream import load_forecaster, load_trained
 
     ours = [word.removeprefix(_PREFIX) for word in overrides if word.startswith(_PREFIX)]
     named = {word.split("=")[0] for word in ours}
@@ -102,8 +120,6 @@ def _measured(
     values: Mapping[str, Any], trained: Trained, forecaster: Forecaster | None, progress: bool
 ) -> dict[str, Any]:
     """The last status of one stream."""
-    from egopose.inference.stream.outputs import open_outputs
-    from egopose.stream import build_loop, settle_memory, source_settings
 
     source = source_settings(values, trained.config)
     loop = build_loop(values, trained, source, forecaster)
@@ -144,7 +160,6 @@ def _listen(server: str, token: str | None) -> None:
 
 def longest_take(config: Mapping[str, Any]) -> str:
     """The wearer's video of the longest take of a configuration's data, rendered where that has not been done."""
-    from egopose.data.preparation import prepare
 
     store = prepare(config, progress=False, flow=False)
     longest = max(range(len(store.takes)), key=lambda i: store.takes[i].length)
@@ -159,10 +174,6 @@ def untrained(config: Mapping[str, Any]) -> Trained:
     Raises:
         InputError: a setting is wrong, or the data cannot be used.
     """
-    import torch
-
-    from egopose.data.preparation import humanoid_of, prepare
-    from egopose.envs.mdp.observations import humanoid_state
 
     torch.manual_seed(0)
     states = humanoid_state(prepare(config, progress=False, flow=False).reference).float()
@@ -175,13 +186,6 @@ def untrained_on(config: Mapping[str, Any], humanoid: HumanoidModel, states: Ten
     Raises:
         InputError: a setting is wrong.
     """
-    from egopose.config import from_mapping
-    from egopose.pipeline import build_env, build_networks
-    from egopose.stream import Trained, still_frames
-    from egopose.training.fragments import Span
-    from egopose.training.regressor_settings import RegressorSettings
-    from egopose.training.supervised import build_regressor
-    from egopose.vision.encoders import build_encoder
 
     encoder = build_encoder(config["vision"]["encoder"])
     settings = from_mapping(RegressorSettings, config["regressor"], "conf/regressor")
@@ -203,10 +207,6 @@ def untrained_forecaster(values: Mapping[str, Any], trained: Trained) -> Forecas
     Raises:
         InputError: a setting is wrong.
     """
-    from egopose.config import compose_config
-    from egopose.pipeline import build_env, build_networks
-    from egopose.sight import planes_of
-    from egopose.stream import Forecaster, forecast_settings, still_frames
 
     settings = forecast_settings(values)
     config = compose_config("train", ["experiment=forecasting"])

@@ -8,6 +8,13 @@ from collections import defaultdict
 from collections.abc import Callable, Sequence
 from typing import Any
 
+import torch
+
+from egopose import pipeline
+from egopose.collection.collectors import CollectorSettings, base_env, build_collector, set_threads
+from egopose.core.runtime import settle_heap
+from egopose.training.ppo import PPO, PPOSettings
+
 
 def run(overrides: Sequence[str], rounds: int) -> dict[str, Any]:
     """Whole iterations of training on the default clips: collect, advantages, update.
@@ -26,12 +33,6 @@ def run(overrides: Sequence[str], rounds: int) -> dict[str, Any]:
     Raises:
         InputError: a setting is unknown or out of range.
     """
-    import torch
-
-    from egopose import pipeline
-    from egopose.runtime import settle_heap
-    from egopose.training.collectors import CollectorSettings, base_env, build_collector, set_threads
-    from egopose.training.ppo import PPO, PPOSettings
 
     config = pipeline.compose_config("train", ["sim=paper", *overrides])
     material = pipeline.motion_material(config)

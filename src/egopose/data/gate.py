@@ -7,37 +7,34 @@ would take hours to show it.
 
 from __future__ import annotations
 
-from egopose.runtime import end_with_parent, prepare_runtime
+import argparse
+import json
+import sys
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from functools import lru_cache, partial
+from multiprocessing import get_context
+from typing import Any
 
-prepare_runtime()
+import numpy as np
+from numpy.typing import NDArray
+from tensordict import TensorDict
 
-import argparse  # noqa: E402
-import json  # noqa: E402
-import sys  # noqa: E402
-from collections.abc import Iterator, Mapping, Sequence  # noqa: E402
-from concurrent.futures import ProcessPoolExecutor  # noqa: E402
-from dataclasses import dataclass  # noqa: E402
-from functools import lru_cache, partial  # noqa: E402
-from multiprocessing import get_context  # noqa: E402
-from typing import Any  # noqa: E402
-
-import numpy as np  # noqa: E402
-from numpy.typing import NDArray  # noqa: E402
-from tensordict import TensorDict  # noqa: E402
-
-from egopose.config import compose_config  # noqa: E402
-from egopose.data.feasibility import contact_residual  # noqa: E402
-from egopose.data.prepare_motion import PreparationSettings, reference_motion  # noqa: E402
-from egopose.data.reference import reference_states, supported  # noqa: E402
-from egopose.data.sources import TakeSource, find_sources  # noqa: E402
-from egopose.errors import InputError  # noqa: E402
-from egopose.humanoid.config import HumanoidConfig, SimConfig  # noqa: E402
-from egopose.humanoid.model import HumanoidModel, build_humanoid  # noqa: E402
-from egopose.humanoid.physics import BatchedPhysics  # noqa: E402
-from egopose.motion import rotations as rot  # noqa: E402
-from egopose.motion.io import read_motion  # noqa: E402
-from egopose.motion.motion import Motion  # noqa: E402
-from egopose.motion.rotations import Array  # noqa: E402
+from egopose.core.config import compose_config
+from egopose.core.errors import InputError
+from egopose.core.runtime import end_with_parent
+from egopose.data.feasibility import contact_residual
+from egopose.data.prepare_motion import PreparationSettings, reference_motion
+from egopose.data.reference import reference_states, supported
+from egopose.data.take_sources import TakeSource, find_sources
+from egopose.humanoid.config import HumanoidConfig, SimConfig
+from egopose.humanoid.model import HumanoidModel, build_humanoid
+from egopose.humanoid.physics import BatchedPhysics
+from egopose.motion import rotations as rot
+from egopose.motion.io import read_motion
+from egopose.motion.motion import Motion
+from egopose.motion.rotations import Array
 
 #: Control steps driven from every start, every how many frames a start, and seconds of reference velocity added to the
 #: target: PD with kd = 0.1 kp lags by 0.1 s of it, and 0.06 s follows best over the first steps.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fcntl
 import os
 import sys
 from collections.abc import Iterator
@@ -20,7 +21,6 @@ def store_lock(root: Path) -> Iterator[None]:
     if sys.platform == "win32" or (root.is_dir() and not os.access(root.parent, os.W_OK)):
         yield
         return
-    import fcntl
 
     root.parent.mkdir(parents=True, exist_ok=True)
     with root.with_name(root.name + ".lock").open("w") as file:

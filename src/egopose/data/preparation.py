@@ -14,20 +14,23 @@ import numpy as np
 import torch
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+from egopose.core.errors import InputError
 from egopose.data.lock import store_lock
 from egopose.data.prepare_motion import PreparationSettings, reference_motion
 from egopose.data.reference import reference_states, supported
-from egopose.data.sources import TakeSource, find_sources
 from egopose.data.store import Fragment, TakeInfo, TakeStore, runs_of
-from egopose.errors import InputError
+from egopose.data.sync import settings_of, sync_offset
+from egopose.data.take_sources import TakeSource, find_sources
 from egopose.humanoid.config import HumanoidConfig, SimConfig
 from egopose.humanoid.model import HumanoidModel, build_humanoid
 from egopose.motion.io import read_motion
 from egopose.motion.motion import Motion
 from egopose.motion.retarget import RetargetReport
 from egopose.vision.corruption import Corruption
+from egopose.vision.features import extract_flow
 from egopose.vision.flow import FlowConfig
 from egopose.vision.lens import Camera
+from egopose.vision.takes import RenderConfig, RenderJob, render_takes
 
 #: Raise it whenever changed code gives another reference, video or flow for unchanged settings and sources: reading of
 #: motion files, retargeting, settling, making of the humanoid, rendering, optical flow. Stores are then made anew.
@@ -127,7 +130,6 @@ def _make_motions(config: Mapping[str, Any], root: Path, progress: bool) -> Take
 
 
 def _find_offset(config: Mapping[str, Any], source: TakeSource, motion: Motion) -> float:
-    from egopose.data.sync import settings_of, sync_offset
 
     assert source.video is not None
     flow = FlowConfig(**config["vision"]["flow"])
@@ -161,7 +163,6 @@ def _row(
 
 
 def _make_videos(config: Mapping[str, Any], store: TakeStore, progress: bool) -> None:
-    from egopose.vision.takes import RenderConfig, RenderJob, render_takes
 
     corruption = Corruption.from_config(config)
     todo = [i for i, take in enumerate(store.takes) if take.rendered]
@@ -214,7 +215,6 @@ def flow_name(config: Mapping[str, Any]) -> str:
 
 
 def _make_flow(config: Mapping[str, Any], store: TakeStore, progress: bool) -> None:
-    from egopose.vision.features import extract_flow
 
     name, settings = flow_name(config), config["vision"]["flow"]
     todo = sorted(set(range(len(store.takes))) - store.flow_done(name))

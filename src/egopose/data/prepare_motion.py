@@ -10,13 +10,13 @@ import numpy as np
 from scipy.signal import butter, sosfiltfilt
 
 from egopose.data.reference import reference_states
+from egopose.humanoid.foot_geometry import sole_edges, sole_names, sole_positions
 from egopose.humanoid.model import HumanoidModel
-from egopose.humanoid.soles import sole_edges, sole_names, sole_positions
 from egopose.motion import rotations as rot
+from egopose.motion.foot_contact_ik import plant_feet
+from egopose.motion.ground_alignment import SettleSettings, settle
 from egopose.motion.motion import Motion
-from egopose.motion.plant import plant_feet
 from egopose.motion.retarget import RetargetReport, retarget
-from egopose.motion.settle import SettleSettings, settle
 
 
 @dataclass(frozen=True)
@@ -25,7 +25,7 @@ class PreparationSettings:
 
     Args:
         cutoff_hz: of the zero-lag low-pass over the retargeted motion; None for none.
-        settle: see :class:`egopose.motion.settle.SettleSettings`.
+        settle: see :class:`egopose.motion.ground_alignment.SettleSettings`.
     """
 
     cutoff_hz: float | None = 8.0

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from egopose.config import convert
+from egopose.core.config import convert
+from egopose.core.errors import InputError
 from egopose.data.store import Fragment, TakeInfo
-from egopose.errors import InputError
 
 
 def split_takes(

@@ -26,11 +26,11 @@ import torch
 from tensordict import MemoryMappedTensor, TensorDict
 from torch import Tensor
 
-from egopose.config import convert, from_mapping
-from egopose.errors import InputError
+from egopose.core.config import convert, from_mapping
+from egopose.core.errors import InputError
+from egopose.core.safe_io import load_tensors, read_json
 from egopose.motion.io import read_motion, write_motion
 from egopose.motion.motion import Motion
-from egopose.untrusted import load_tensors, read_json
 
 SCHEMA = 1
 #: What every frame of ``reference/`` has; see :func:`egopose.data.reference.reference_states`.

@@ -16,16 +16,16 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Slerp
 
-from egopose.config import from_mapping
+from egopose.core.config import from_mapping
+from egopose.core.errors import InputError
 from egopose.data.prepare_motion import without_lead_in
-from egopose.errors import InputError
 from egopose.motion import rotations as rot
 from egopose.motion.mapping import identify
 from egopose.motion.motion import Motion
 from egopose.motion.rotations import Array
+from egopose.vision.camera_rotation import camera_turning
 from egopose.vision.flow import FlowConfig, flow_of_frames
 from egopose.vision.lens import Camera, undo_rolling_shutter
-from egopose.vision.turning import camera_turning
 from egopose.vision.video import Frame, probe_video, read_frames
 
 

@@ -13,8 +13,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from egopose.config import from_mapping
-from egopose.errors import InputError
+from egopose.core.config import from_mapping
+from egopose.core.errors import InputError
 
 
 def ramp(start: float, end: float, steps: int, taken: Tensor) -> Tensor:

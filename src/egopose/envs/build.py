@@ -4,20 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from tensordict import TensorDictBase
 from torch import Tensor
 
 from egopose.envs.aids import Aids
 from egopose.envs.env import EgoPoseEnv
-from egopose.envs.futures import Futures
 from egopose.envs.mdp.rewards import build_reward
 from egopose.envs.problem import ActionSettings, ImitationProblem, TakeTable, TerminationSettings
+from egopose.envs.reference_forecasts import Futures
 from egopose.envs.starts import AdaptiveStarts, FragmentLike, Starts, UniformStarts, WholeFragments, after_context
-
-if TYPE_CHECKING:
-    from egopose.humanoid.model import HumanoidModel
+from egopose.humanoid.model import HumanoidModel
 
 
 def build_problem(

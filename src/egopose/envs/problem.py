@@ -4,20 +4,17 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from types import SimpleNamespace
-from typing import TYPE_CHECKING
 
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
-from egopose.envs.futures import Futures
 from egopose.envs.mdp import terminations
 from egopose.envs.mdp.observations import BodyLayout, BodyState, BodyView, humanoid_state_rows
 from egopose.envs.mdp.rewards import Reward
+from egopose.envs.reference_forecasts import Futures
+from egopose.humanoid.model import HumanoidModel
 from egopose.humanoid.torques import torque_driven
-
-if TYPE_CHECKING:
-    from egopose.humanoid.model import HumanoidModel
 
 BODY_KEYS = ("qpos", "qvel", "xpos", "xquat", "com")
 

@@ -4,29 +4,27 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from torchrl.envs import TransformedEnv
 
+from egopose.core.errors import InputError
+from egopose.core.runtime import torch_threads
 from egopose.envs.starts import FragmentLike
-from egopose.errors import InputError
 from egopose.evaluation.protocols import ContactSettings, TakeScores, score_take
-from egopose.evaluation.survival import base_tracking, frames_survived, reference_tracking
-from egopose.evaluation.triggers import TakeTriggers, as_dict, take_triggers
+from egopose.evaluation.resets import TakeTriggers, as_dict, take_triggers
+from egopose.inference.counterfactuals import Forks
 from egopose.inference.estimator import Controller, Estimate, estimate_takes
 from egopose.inference.failsafe import FailSafe, FailSafeSettings
-from egopose.inference.forks import Forks
+from egopose.inference.planner import Planner
 from egopose.inference.planner_settings import PlannerSettings, planned_kappa
-from egopose.inference.planning import Planner
 from egopose.models.pose_regression import pose_regression
 from egopose.motion import rotations as rot
 from egopose.motion.motion import Motion
 from egopose.motion.rotations import Array
-from egopose.runtime import torch_threads
-
-if TYPE_CHECKING:
-    from egopose.pipeline import Agent
+from egopose.pipeline.agent import Agent
+from egopose.training.survival import base_tracking, frames_survived, reference_tracking
 
 SHORTEST = 4  # frames that every metric needs
 _PLANNED_TOGETHER = 4  # fragments: with 64 copies each enough to keep the physics' threads busy
@@ -64,7 +62,7 @@ def evaluate_agent(
     """Estimate every fragment in one pass, all side by side, and score it beside PoseReg.
 
     Args:
-        agent: see :func:`egopose.pipeline.load_agent`.
+        agent: see :func:`egopose.pipeline.agent.load_agent`.
         fragments: those of ``split``, in the material's order.
         names: one a fragment.
         split: ``test`` or ``train``.
@@ -191,7 +189,7 @@ def _result(
 
 
 def failsafe_figures(results: Sequence[FragmentResult], settings: FailSafeSettings, window: int) -> dict[str, Any]:
-    """A run's fail-safe for JSON: mode, kappa and window, and :func:`egopose.evaluation.triggers.as_dict` of it all."""
+    """A run's fail-safe for JSON: mode, kappa and window, and :func:`egopose.evaluation.resets.as_dict` of it all."""
     judged = [(one.motion.name, one.triggers) for one in results if one.triggers is not None]
     names, takes = [name for name, _ in judged], [found for _, found in judged]
     about = {"mode": settings.mode, "kappa": settings.kappa, "window_frames": window}
@@ -208,7 +206,7 @@ def survival_figures(
     The last two only where actions are targets of PD controllers.
 
     Args:
-        agent: see :func:`egopose.pipeline.load_agent`.
+        agent: see :func:`egopose.pipeline.agent.load_agent`.
         start_policy: an actor as training found it.
         split: ``test`` or ``train``.
         worlds: episodes.

@@ -14,19 +14,19 @@ from typing import Any
 
 import numpy as np
 
-from egopose.errors import InputError
+from egopose.core.errors import InputError
+from egopose.core.safe_io import read_json
 from egopose.evaluation import charts, page
 from egopose.evaluation.charts import Line
+from egopose.evaluation.estimation_page import ReportSettings, root_aligned_errors
+from egopose.evaluation.forecast_metrics import METRICS
 from egopose.evaluation.forecast_report import FUTURE_COLOUR, TRUTH_COLOUR, other_file
-from egopose.evaluation.forecasting import METRICS
-from egopose.evaluation.html_report import ReportSettings, root_aligned_errors
 from egopose.evaluation.report import RENDERED_NOTE
 from egopose.humanoid.model import HumanoidModel
 from egopose.motion.io import read_motion
 from egopose.motion.motion import Motion
 from egopose.motion.rotations import Array
-from egopose.untrusted import read_json
-from egopose.vision.ghosts import ghost_frames
+from egopose.vision.overlay import ghost_frames
 
 _UNITS = {"E_pose": "rad", "E_vel": "", "A_accl": ""}
 _SPREAD = (0.1, 0.9)  # of the windows: the ground about the mean

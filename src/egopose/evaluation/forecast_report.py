@@ -10,14 +10,15 @@ from typing import Any
 
 import numpy as np
 
+from egopose.data.windows import ForecastWindow
 from egopose.evaluation import tables
 from egopose.evaluation.compose import middle_square
-from egopose.evaluation.forecasting import METRICS, ForecastScores, ForecastWindow
+from egopose.evaluation.forecast_metrics import METRICS, ForecastScores
 from egopose.evaluation.report import TakeVideo, file_name
 from egopose.evaluation.statistics import Interval, mean_interval, ratio_interval
 from egopose.humanoid.model import HumanoidModel
 from egopose.motion.rotations import Array
-from egopose.vision.ghosts import ghost_frames
+from egopose.vision.overlay import ghost_frames
 from egopose.vision.rendering import label_frame
 from egopose.vision.video import Frame, iter_frames, write_video
 

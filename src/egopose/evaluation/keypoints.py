@@ -12,12 +12,12 @@ from pathlib import Path
 
 import numpy as np
 
-from egopose.errors import InputError
+from egopose.core.errors import InputError
+from egopose.core.safe_io import read_json
 from egopose.evaluation.metrics import keypoint_error
 from egopose.motion import rotations as rot
 from egopose.motion.rotations import Array
 from egopose.motion.skeleton import Skeleton
-from egopose.untrusted import read_json
 
 #: Joints of the humanoid in the order of the keypoints: shoulder, elbow, wrist, hip, knee, ankle; right, then left.
 KEYPOINTS = (

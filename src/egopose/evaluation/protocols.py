@@ -20,8 +20,8 @@ from egopose.envs.starts import FragmentLike
 from egopose.evaluation import metrics, position_metrics
 from egopose.evaluation.keypoints import motion_keypoints, side_view_error
 from egopose.evaluation.statistics import Interval, mean_interval, ratio_interval
+from egopose.humanoid.foot_geometry import sole_positions
 from egopose.humanoid.model import HumanoidModel
-from egopose.humanoid.soles import sole_positions
 from egopose.motion.contacts import contact_labels
 from egopose.motion.motion import Motion
 from egopose.motion.rotations import Array

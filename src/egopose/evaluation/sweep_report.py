@@ -12,12 +12,12 @@ from typing import Any
 
 import numpy as np
 
-from egopose.errors import InputError
+from egopose.core.errors import InputError
+from egopose.core.safe_io import read_json, read_yaml
 from egopose.evaluation import charts, page
 from egopose.evaluation.charts import Line
 from egopose.evaluation.protocols import METRICS
 from egopose.motion.rotations import Array
-from egopose.untrusted import read_json, read_yaml
 
 _STEPS = "steps"
 

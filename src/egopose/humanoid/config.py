@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from egopose.errors import InputError
+from egopose.core.errors import InputError
 from egopose.motion.skeleton import Dof, Joint, Skeleton
 
 Vector = tuple[float, float, float]

@@ -12,7 +12,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from egopose.errors import InputError
+from egopose.core.errors import InputError
 from egopose.humanoid.config import HumanoidConfig, SimConfig, Vector
 from egopose.humanoid.model import HumanoidModel, build_humanoid
 from egopose.motion.calibration import neutral_stance, part_positions

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.optimize import nnls
 from scipy.signal import butter, sosfiltfilt
 
-from egopose.errors import InputError
+from egopose.core.errors import InputError
 from egopose.humanoid.model import HumanoidModel
 from egopose.motion import rotations as rot
 from egopose.motion.ground_reaction import GroundReaction

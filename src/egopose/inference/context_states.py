@@ -11,9 +11,9 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from egopose.data.spans import Span
+from egopose.models.predictions import Flow, predict_span
 from egopose.models.regressor import StateRegressor
-from egopose.training.fragments import Span
-from egopose.training.predictions import Flow, predict_span
 
 
 def context_states(

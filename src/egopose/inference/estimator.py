@@ -21,11 +21,11 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from egopose.envs.env import EgoPoseEnv
 from egopose.envs.transforms import StateNormalizer
+from egopose.humanoid.foot_geometry import out_of_floor
 from egopose.humanoid.model import HumanoidModel
-from egopose.humanoid.soles import out_of_floor
+from egopose.inference.counterfactuals import Forks
 from egopose.inference.failsafe import FailSafe
-from egopose.inference.forks import Forks
-from egopose.inference.planning import Planner
+from egopose.inference.planner import Planner
 from egopose.models.episode_context import EpisodeContext
 from egopose.models.pose_regression import state_to_qpos
 from egopose.motion import rotations as rot

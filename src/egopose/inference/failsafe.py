@@ -14,7 +14,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from egopose.errors import InputError
+from egopose.core.errors import InputError
 
 MODES = ("value", "naive", "off")
 #: Yuan & Kitani 2019, sections 3.3 and 4: kappa, and the discount their values have.

@@ -17,10 +17,10 @@ from torchrl.envs import TransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from egopose.envs.env import EgoPoseEnv
+from egopose.humanoid.foot_geometry import out_of_floor
 from egopose.humanoid.model import HumanoidModel
-from egopose.humanoid.soles import out_of_floor
 from egopose.inference.estimator import Controller, prepare_for_test
-from egopose.inference.planning import Planner
+from egopose.inference.planner import Planner
 from egopose.models.pose_regression import state_to_qpos
 from egopose.motion import rotations as rot
 from egopose.motion.rotations import Array

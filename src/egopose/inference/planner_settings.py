@@ -1,4 +1,4 @@
-"""``conf/planner``: how a body looks ahead (:mod:`egopose.inference.planning`)."""
+"""``conf/planner``: how a body looks ahead (:mod:`egopose.inference.planner`)."""
 
 from __future__ import annotations
 
@@ -6,8 +6,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from egopose.config import from_mapping
-from egopose.errors import InputError
+from egopose.core.config import from_mapping
+from egopose.core.errors import InputError
 
 
 @dataclass(frozen=True)

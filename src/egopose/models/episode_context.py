@@ -8,7 +8,7 @@ import torch
 from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 
-from egopose.errors import InputError
+from egopose.core.errors import InputError
 from egopose.models.context import BidirectionalContext
 
 # Frames of context kept between steps (134 MB at 128 numbers); more than 1000 episodes of 220 frames.

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from egopose.errors import InputError
+from egopose.core.errors import InputError
 
 #: Columns of the state z in either plane: lean (of the de-headed root quaternion), its rate, the root's speed. Counted
 #: for z = [height 1, quaternion 4, D angles, linear velocity 3, angular velocity 3, D rates].

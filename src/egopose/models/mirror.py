@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from egopose.errors import InputError
+from egopose.core.errors import InputError
 from egopose.motion.skeleton import Skeleton
 
 _PLANE = np.array([1.0, -1.0, 1.0])

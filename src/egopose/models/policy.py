@@ -19,8 +19,8 @@ from torch import Tensor, nn
 from torchrl.envs.utils import ExplorationType
 from torchrl.modules import MLP, IndependentNormal, ProbabilisticActor, ValueOperator
 
-from egopose.config import from_mapping
-from egopose.errors import InputError
+from egopose.core.config import from_mapping
+from egopose.core.errors import InputError
 from egopose.models.context import BidirectionalContext, ForwardContext
 from egopose.models.episode_context import EpisodeContext, episode_context_module
 from egopose.models.feedback import BalanceFeedback, FeedbackSettings

@@ -2,7 +2,7 @@
 
 phi, the context, is the last output of a forward LSTM over the frames seen, fixed for the rollout; nu_t, the memory, is
 the output of a forward LSTM over the states z_1 .. z_t. That one is TorchRL's ``LSTMModule``: step by step in acting,
-its hidden state going from step to step in the TensorDict (:class:`egopose.envs.forecasting.RecurrentStates` begins
+its hidden state going from step to step in the TensorDict (:class:`egopose.envs.forecasting_transforms.RecurrentStates` begins
 it), and whole sequences ``[N, T]`` at once under ``torchrl.modules.set_recurrent_mode`` while learning.
 """
 
@@ -13,7 +13,7 @@ from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequ
 from torch import Tensor, nn
 from torchrl.modules import LSTMModule
 
-from egopose.errors import InputError
+from egopose.core.errors import InputError
 from egopose.models.context import ForwardContext
 from egopose.models.episode_context import WindowCache, parameter_version
 

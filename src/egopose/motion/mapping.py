@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from egopose.errors import InputError
+from egopose.core.errors import InputError
 from egopose.motion.skeleton import Skeleton
 
 SIDES = ("right", "left")

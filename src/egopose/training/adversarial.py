@@ -16,8 +16,8 @@ from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule
 from torch import Tensor, nn
 from torchrl.modules import MLP
 
-from egopose.config import from_mapping
-from egopose.errors import InputError
+from egopose.core.config import from_mapping
+from egopose.core.errors import InputError
 from egopose.models.regressor import state_statistics
 from egopose.training.ppo import PPO, PPOSettings
 

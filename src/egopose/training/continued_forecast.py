@@ -4,20 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from torch import Tensor
 
-from egopose.config import from_mapping
-from egopose.errors import InputError
+from egopose.core.config import from_mapping
+from egopose.core.errors import InputError
+from egopose.data.spans import Span
 from egopose.models.mirror import StateMirror
 from egopose.models.motion_forecast import ContinuedForecaster, spline_times
-from egopose.training.baselines import FitResult, FitSettings, fit
-from egopose.training.fragments import Span
+from egopose.training.fitting import FitResult, FitSettings, fit
+from egopose.training.motion_forecast import ForecasterSettings
 from egopose.training.recurrent_baselines import RecurrentLearner, RecurrentSettings, build_forecaster
-
-if TYPE_CHECKING:
-    from egopose.training.motion_forecast import ForecasterSettings
 
 
 @dataclass(frozen=True)

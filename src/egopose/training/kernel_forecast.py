@@ -4,20 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
-from egopose.errors import InputError
+from egopose.core.errors import InputError
+from egopose.data.spans import Span
 from egopose.models.kernel_regression import KernelRegression, fit_kernel_regression
 from egopose.models.mirror import StateMirror
 from egopose.models.motion_forecast import KernelForecaster, spline_basis
 from egopose.models.regressor import state_statistics
-from egopose.training.fragments import Span
-
-if TYPE_CHECKING:
-    from egopose.training.motion_forecast import ForecasterSettings
+from egopose.training.motion_forecast import ForecasterSettings
 
 
 @dataclass(frozen=True)

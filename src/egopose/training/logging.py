@@ -17,9 +17,10 @@ from typing import Any, Protocol
 from omegaconf import OmegaConf
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from torch.utils.tensorboard import SummaryWriter
 
-from egopose.errors import InputError
-from egopose.files import write_text_whole
+from egopose.core.atomic_write import write_text_whole
+from egopose.core.errors import InputError
 
 PACKAGES = ("egopose", "torch", "torchrl", "tensordict", "mujoco", "dm-control", "numpy", "hydra-core")
 CURVES = "curves.csv"
@@ -98,7 +99,6 @@ class TensorBoardScalars:
     """TensorBoard events under ``folder``; works without network."""
 
     def __init__(self, folder: Path, purge_after: int | None = None) -> None:
-        from torch.utils.tensorboard import SummaryWriter
 
         self.writer = SummaryWriter(str(folder), purge_step=None if purge_after is None else purge_after + 1)
 

@@ -17,15 +17,15 @@ import torch
 from tensordict import TensorDictBase
 from torchrl.checkpoint import GlobalRNGState
 
-from egopose.config import from_mapping
-from egopose.errors import InputError
-from egopose.training import checkpoint as checkpoints
-from egopose.training import collectors
-from egopose.training.collectors import CollectorSettings
+from egopose.checkpoint import checkpoint as checkpoints
+from egopose.collection import collectors
+from egopose.collection.collectors import CollectorSettings
+from egopose.collection.workers import WorkerLost
+from egopose.core.config import from_mapping
+from egopose.core.errors import InputError
 from egopose.training.exploration import SigmaSchedule
 from egopose.training.logging import ProgressLine, Scalars
 from egopose.training.ppo import PPO, TrainingDiverged
-from egopose.training.workers import WorkerLost
 
 Evaluation = Callable[[int], Mapping[str, float]]
 
@@ -118,7 +118,7 @@ class Run:
 
     Args:
         ppo: the learner.
-        collector: from :func:`egopose.training.collectors.build_collector`.
+        collector: from :func:`egopose.collection.collectors.build_collector`.
         settings: see :class:`LoopSettings`.
         collector_settings: threads.
         folder: the run directory.

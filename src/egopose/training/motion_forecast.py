@@ -10,13 +10,13 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from egopose.config import from_mapping
-from egopose.errors import InputError
+from egopose.core.config import from_mapping
+from egopose.core.errors import InputError
+from egopose.data.spans import Span, split_validation, without_block
 from egopose.models.mirror import StateMirror
 from egopose.models.motion_forecast import MotionForecaster, spline_basis
 from egopose.models.regressor import state_statistics
 from egopose.training.continued_forecast import ContinuedSettings
-from egopose.training.fragments import Span, split_validation, without_block
 from egopose.training.kernel_forecast import Contexts, KernelSettings
 
 
@@ -113,7 +113,7 @@ def cross_fit_starts(
 
 
 class ForecastLearner:
-    """A :class:`egopose.training.baselines.Learner` of windows of context and horizon.
+    """A :class:`egopose.training.fitting.Learner` of windows of context and horizon.
 
     The loss is E_pose (Yuan & Kitani 2019, section 4.3) of every frame of the curve, root angles for small leans, and a
     little of all else a body needs to follow it.

@@ -7,14 +7,21 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from egopose.core.runtime import torch_threads
+from egopose.data.spans import Span, without_block
 from egopose.humanoid.model import HumanoidModel
 from egopose.models.blended import MeanOfKernels
+from egopose.models.predictions import Flow
 from egopose.models.regressor import StateRegressor
-from egopose.runtime import torch_threads
-from egopose.training.blending import KernelSettings, fit_kernels, importance_of, mirror_image, view_table, windowed
-from egopose.training.fragments import Span, without_block
-from egopose.training.predictions import Flow
-from egopose.training.regressor_settings import RegressorSettings
+from egopose.models.regressor_settings import RegressorSettings
+from egopose.training.blended_regressor import (
+    KernelSettings,
+    fit_kernels,
+    importance_of,
+    mirror_image,
+    view_table,
+    windowed,
+)
 
 _CONTEXTS = 64  # contexts that are regressed together
 

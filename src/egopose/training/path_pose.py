@@ -11,10 +11,10 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from egopose.config import from_mapping
-from egopose.errors import InputError
+from egopose.core.config import from_mapping
+from egopose.core.errors import InputError
+from egopose.data.spans import Span, split_validation
 from egopose.models.baselines.path_pose import PathPose, cluster_poses, transition_costs
-from egopose.training.fragments import Span, split_validation
 
 
 @dataclass(frozen=True)
@@ -59,7 +59,7 @@ def build_path_pose(settings: PathPoseSettings, clusters: int, state_size: int) 
 
 
 class PathPoseLearner:
-    """A :class:`egopose.training.baselines.Learner`: poses are clustered at once, the classifier is what is fitted.
+    """A :class:`egopose.training.fitting.Learner`: poses are clustered at once, the classifier is what is fitted.
 
     Args:
         flow: ``[F, 2, S, S]`` of the whole store.

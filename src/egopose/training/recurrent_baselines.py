@@ -10,12 +10,12 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from egopose.config import from_mapping
-from egopose.errors import InputError
+from egopose.core.config import from_mapping
+from egopose.core.errors import InputError
+from egopose.data.spans import Span, split_validation
 from egopose.models.baselines.recurrent import RecurrentForecaster, ground_truth_mask
 from egopose.models.mirror import StateMirror
 from egopose.models.regressor import state_statistics
-from egopose.training.fragments import Span, split_validation
 
 SCHEMES = ("noise", "alternate")
 
@@ -73,7 +73,7 @@ def build_forecaster(settings: RecurrentSettings, mean: Tensor, std: Tensor, see
 
 
 class RecurrentLearner:
-    """A :class:`egopose.training.baselines.Learner` of windows of context and horizon.
+    """A :class:`egopose.training.fitting.Learner` of windows of context and horizon.
 
     Args:
         poses: ``[F, P]`` pose states of all frames.

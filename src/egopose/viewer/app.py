@@ -11,14 +11,14 @@ from typing import Any
 
 import numpy as np
 
+from egopose.viewer.auth_proxy import Address
+from egopose.viewer.charts import Chart
 from egopose.viewer.clip import Clip, Footage, Run
-from egopose.viewer.curves import Chart
-from egopose.viewer.door import Address
 from egopose.viewer.figure import Color, Figure
 from egopose.viewer.player import Player
 from egopose.viewer.serving import furnish, open_server, tile
 from egopose.viewer.sync_panel import SyncPanel
-from egopose.viewer.wearer import Pictures
+from egopose.viewer.video_panel import Pictures
 
 _MAIN: Color = (70, 110, 220)
 _OTHER: Color = (235, 140, 40)

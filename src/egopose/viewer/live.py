@@ -12,12 +12,12 @@ import numpy as np
 from websockets.exceptions import WebSocketException
 from websockets.sync.client import connect
 
-from egopose.errors import InputError
+from egopose.core.errors import InputError
 from egopose.motion.io.native import skeleton_from_json
 from egopose.motion.kinematics import forward_kinematics
 from egopose.motion.rotations import Array
-from egopose.viewer.curves import Chart
-from egopose.viewer.door import Address
+from egopose.viewer.auth_proxy import Address
+from egopose.viewer.charts import Chart
 from egopose.viewer.figure import Color
 from egopose.viewer.serving import furnish, open_server, tile
 from egopose.viewer.shapes import surface_of

@@ -9,7 +9,7 @@ import numpy as np
 import viser
 
 from egopose.motion.rotations import Array
-from egopose.viewer.door import Address, Door
+from egopose.viewer.auth_proxy import Address, Door
 
 
 class Server(viser.ViserServer):

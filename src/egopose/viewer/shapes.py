@@ -11,7 +11,7 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
-from egopose.config import compose_config
+from egopose.core.config import compose_config
 from egopose.humanoid.config import HumanoidConfig
 from egopose.humanoid.model import HumanoidModel, build_humanoid
 from egopose.motion import rotations as rot

@@ -11,12 +11,12 @@ from typing import Any
 import numpy as np
 import viser
 
-from egopose.config import compose_config
+from egopose.core.config import compose_config
+from egopose.core.errors import InputError
 from egopose.data.sync import Sync, find_offset, head_turning, settings_of, video_turning
-from egopose.errors import InputError
 from egopose.motion.rotations import Array
+from egopose.viewer.charts import Chart
 from egopose.viewer.clip import Clip, Footage
-from egopose.viewer.curves import Chart
 from egopose.vision.flow import FlowConfig
 from egopose.vision.lens import Camera
 

@@ -12,10 +12,11 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from safetensors.torch import load_file
 from torch import Tensor, nn
 from torch.nn import functional
 
-from egopose.errors import InputError
+from egopose.core.errors import InputError
 
 log = logging.getLogger(__name__)
 
@@ -119,7 +120,6 @@ class ResNet18FlowEncoder(FlowEncoder):
         self.head = nn.Linear(512, features)
 
     def _load(self, folder: Path) -> None:
-        from safetensors.torch import load_file
 
         file = folder / "model.safetensors"
         if not file.is_file():

@@ -11,10 +11,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from egopose.vision.body_parts import LimbFinder, Picture, as_plane, limb_rows, small_picture
 from egopose.vision.encoders import FlowEncoder
 from egopose.vision.flow import FlowConfig, flow_of_frames
 from egopose.vision.lens import Camera, undo_rolling_shutter
-from egopose.vision.limbs import LimbFinder, Picture, as_plane, limb_rows, small_picture
 from egopose.vision.video import Frame, iter_frames, probe_video
 
 
@@ -40,7 +40,7 @@ def extract_flow(
 
     Returns:
         ``[T, 2, S, S]`` float16, image widths per frame; frame t's is from t-1 to t, frame 0's is zero. With a finder
-        ``[T, 3, S, S]``, see :func:`egopose.vision.limbs.as_plane`.
+        ``[T, 3, S, S]``, see :func:`egopose.vision.body_parts.as_plane`.
 
     Raises:
         InputError: the video cannot be read or does not cover the motion.
@@ -67,7 +67,7 @@ def extract_limbs(
     offset: float,
     camera: Camera | None,
 ) -> NDArray[np.float16]:
-    """``[T, 2 Q]``, see :func:`egopose.vision.limbs.limb_rows`, of a video whose flow ``[T, 2, S, S]`` is there.
+    """``[T, 2 Q]``, see :func:`egopose.vision.body_parts.limb_rows`, of a video whose flow ``[T, 2, S, S]`` is there.
 
     Other arguments, and errors, as of :func:`extract_flow`.
     """

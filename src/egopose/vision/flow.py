@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from egopose.errors import InputError
+from egopose.core.errors import InputError
 from egopose.vision.video import Frame
 
 PRESETS = {

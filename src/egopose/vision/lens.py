@@ -14,8 +14,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from egopose.config import from_mapping
-from egopose.errors import InputError
+from egopose.core.config import from_mapping
+from egopose.core.errors import InputError
 from egopose.motion.rotations import Array
 from egopose.vision.video import Frame
 

@@ -13,10 +13,10 @@ from typing import Any
 
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from egopose.errors import InputError
+from egopose.core.errors import InputError
+from egopose.core.runtime import end_with_parent
+from egopose.core.safe_io import read_json
 from egopose.motion.rotations import Array
-from egopose.runtime import end_with_parent
-from egopose.untrusted import read_json
 from egopose.vision.corruption import Corruption
 from egopose.vision.gl import choose_backend
 from egopose.vision.rendering import CameraConfig, render_wearer_video

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from egopose.errors import InputError
+from egopose.core.errors import InputError
 
 Frame = NDArray[np.uint8]
 

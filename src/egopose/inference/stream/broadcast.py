@@ -15,11 +15,12 @@ from http import HTTPStatus
 from typing import TYPE_CHECKING
 from urllib.parse import parse_qs, urlsplit
 
-from egopose.errors import InputError
+from egopose.core.errors import InputError
 
 if TYPE_CHECKING:
     from websockets.asyncio.server import ServerConnection
     from websockets.http11 import Request, Response
+
 
 _FIELD = "conf/stream.yaml: server"
 

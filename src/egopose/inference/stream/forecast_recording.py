@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from egopose.errors import InputError
-from egopose.inference.stream.futures import ForecastSettings, LiveForecast
+from egopose.core.errors import InputError
+from egopose.inference.stream.live_forecasts import ForecastSettings, LiveForecast
 from egopose.motion.io.native import skeleton_to_json
 from egopose.motion.skeleton import Skeleton
 

@@ -15,8 +15,8 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from egopose.inference.stream.futures import LiveForecast, LiveFutures, Moment
 from egopose.inference.stream.latency import LatencyTable
+from egopose.inference.stream.live_forecasts import LiveForecast, LiveFutures, Moment
 from egopose.motion.rotations import Array
 
 #: Told a forecast and how long it took from when it was due (ms), on the forecasts' thread.

@@ -10,8 +10,8 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 from torchrl.envs import TransformedEnv
 
-from egopose.envs.futures import FollowFuture
-from egopose.errors import InputError
+from egopose.core.errors import InputError
+from egopose.envs.reference_forecasts import FollowFuture
 from egopose.models.recurrent import PastContext
 from egopose.models.regressor import StateRegressor
 from egopose.motion.rotations import Array
@@ -91,7 +91,7 @@ class FollowedCurve:
 def guide_of(
     env: TransformedEnv, actor: TensorDictModuleBase, regressor: StateRegressor, curves: Curves | None
 ) -> Guide:
-    """Of a forecasting policy, see :class:`egopose.inference.stream.futures.LiveFutures`.
+    """Of a forecasting policy, see :class:`egopose.inference.stream.live_forecasts.LiveFutures`.
 
     Raises:
         InputError: the policy does not forecast.

@@ -16,14 +16,14 @@ from dataclasses import dataclass
 from typing import Any
 
 from egopose.inference.causal import CausalRegression
-from egopose.inference.stream.body import LiveBody, LivePose
 from egopose.inference.stream.clock import ControlClock
 from egopose.inference.stream.forecasting import ForecastSink, ForecastThread
+from egopose.inference.stream.frame_features import Sight
+from egopose.inference.stream.frame_sources import SourceSettings, capture
 from egopose.inference.stream.latency import LatencyTable
+from egopose.inference.stream.live_body import LiveBody, LivePose
 from egopose.inference.stream.memory import MemoryTrace
-from egopose.inference.stream.newest import Captured, NewestFrame
-from egopose.inference.stream.sight import Sight
-from egopose.inference.stream.sources import SourceSettings, capture
+from egopose.inference.stream.newest_frame import Captured, NewestFrame
 
 #: In the order in which a frame passes them.
 STAGES = ("flow", "encoder", "context", "policy", "physics", "output")

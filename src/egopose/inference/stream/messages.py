@@ -17,9 +17,9 @@ from typing import Any
 
 import numpy as np
 
-from egopose.errors import InputError
-from egopose.inference.stream.body import LivePose
-from egopose.inference.stream.futures import ForecastSettings, LiveForecast
+from egopose.core.errors import InputError
+from egopose.inference.stream.live_body import LivePose
+from egopose.inference.stream.live_forecasts import ForecastSettings, LiveForecast
 from egopose.motion.io.native import skeleton_to_json
 from egopose.motion.rotations import Array
 from egopose.motion.skeleton import Skeleton

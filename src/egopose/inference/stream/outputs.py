@@ -7,22 +7,20 @@ import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from egopose.config import from_mapping
-from egopose.errors import InputError
+from egopose.core.config import from_mapping
+from egopose.core.errors import InputError
+from egopose.humanoid.model import HumanoidModel
 from egopose.inference.stream import messages
-from egopose.inference.stream.body import LivePose
 from egopose.inference.stream.broadcast import Broadcast, ServerSettings
 from egopose.inference.stream.forecast_recording import ForecastRecording
 from egopose.inference.stream.forecasting import ForecastSink
-from egopose.inference.stream.futures import ForecastSettings, LiveForecast
+from egopose.inference.stream.frame_sources import SourceSettings
+from egopose.inference.stream.live_body import LivePose
+from egopose.inference.stream.live_forecasts import ForecastSettings, LiveForecast
 from egopose.inference.stream.loop import PoseSink, StatusSink
 from egopose.inference.stream.recording import Recording
-from egopose.inference.stream.sources import SourceSettings
-
-if TYPE_CHECKING:
-    from egopose.humanoid.model import HumanoidModel
 
 
 @dataclass(frozen=True)

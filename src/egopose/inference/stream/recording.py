@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from egopose.errors import InputError
-from egopose.inference.stream.body import LivePose
+from egopose.core.errors import InputError
+from egopose.inference.stream.live_body import LivePose
 from egopose.motion.io.native import write_native
 from egopose.motion.motion import Motion
 from egopose.motion.rotations import Array

@@ -1,7 +1,7 @@
 """Readers and writers of motion: one file a format, one door for all.
 
 Every reader gives a :class:`~egopose.motion.motion.Motion`: z up, metres, radians; every fault of a file is one
-:class:`~egopose.errors.InputError`.
+:class:`~egopose.core.errors.InputError`.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from egopose.errors import InputError
+from egopose.core.errors import InputError
 from egopose.motion.io._npz import entry_names
 from egopose.motion.io.acclaim import read_amc
 from egopose.motion.io.amass import read_amass

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from egopose.errors import InputError
+from egopose.core.errors import InputError
 
 #: The largest text file read, bytes: an hour of 30 joints at 60 frames/s. Text with one rare letter takes four times
 #: its bytes in memory, and a reader holds it twice.

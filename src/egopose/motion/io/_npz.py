@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from egopose.errors import InputError
+from egopose.core.errors import InputError
 
 #: The most that is unpacked from one file, bytes, and the most numbers of one array: half an hour of AMASS at 120
 #: frames/s. Readers turn every number into a double and hold about six copies.

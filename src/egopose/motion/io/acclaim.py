@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from egopose.errors import InputError
+from egopose.core.errors import InputError
 from egopose.motion import rotations as rot
 from egopose.motion.io._files import excerpt
 from egopose.motion.io.acclaim_syntax import AsfFile, parse_amc, parse_asf

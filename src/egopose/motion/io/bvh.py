@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from egopose.errors import InputError
+from egopose.core.errors import InputError
 from egopose.motion import rotations as rot
 from egopose.motion.io.body_size import STATURE_RANGE, guess_unit, guess_up, stature
 from egopose.motion.io.bvh_syntax import BvhFile, BvhJoint, parse_bvh

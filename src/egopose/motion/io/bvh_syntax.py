@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from egopose.errors import InputError
+from egopose.core.errors import InputError
 from egopose.motion.io._files import MAX_JOINTS, check_values, excerpt, read_text
 from egopose.motion.rotations import Array
 

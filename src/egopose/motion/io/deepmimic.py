@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Slerp
 
-from egopose.errors import InputError
+from egopose.core.errors import InputError
 from egopose.motion import rotations as rot
 from egopose.motion.io._files import read_text
 from egopose.motion.io.frames import euler_angles, frame_rate, up_rotation

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from egopose.errors import InputError
+from egopose.core.errors import InputError
 from egopose.motion.ground_reaction import GroundReaction
 from egopose.motion.io._files import MAX_JOINTS
 from egopose.motion.io._npz import read_arrays

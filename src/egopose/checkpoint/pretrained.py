@@ -1,0 +1,44 @@
+"""Trained weights that come with the package: a small run directory each, named ``weights:NAME`` on a command line.
+
+``egopose ship`` makes them, ``docs/model-card.md`` says what they are.
+"""
+
+from __future__ import annotations
+
+import difflib
+from pathlib import Path
+
+from egopose.checkpoint.checkpoint import check_files
+from egopose.core.errors import InputError
+
+PREFIX = "weights:"
+#: What a shipped run is: provenance and figures. Its presence makes a folder one.
+ABOUT = "weights.json"
+FOLDER = Path(__file__).resolve().parents[1] / "weights"
+
+
+def shipped_names() -> list[str]:
+    """The names there are, sorted."""
+    return sorted(path.parent.name for path in FOLDER.glob(f"*/{ABOUT}"))
+
+
+def shipped_run(name: str) -> Path:
+    """The run directory of ``weights:NAME``, every file compared with its checksum.
+
+    Raises:
+        InputError: there is no such name, or a file is missing, added or altered.
+    """
+
+    wanted, there = name.removeprefix(PREFIX), shipped_names()
+    if wanted not in there:
+        near = difflib.get_close_matches(wanted, there, 1)
+        meant = f"; did you mean {PREFIX}{near[0]}?" if near else ""
+        listed = ", ".join(f"{PREFIX}{one}" for one in there) or "none"
+        raise InputError("checkpoint", name, f"no such weights come with egopose{meant or f'; there are {listed}'}")
+    check_files(FOLDER / wanted)
+    return FOLDER / wanted
+
+
+def is_shipped(path: str | Path) -> bool:
+    """Whether ``path`` is a name ``weights:...`` and no file."""
+    return str(path).startswith(PREFIX)

@@ -1,0 +1,174 @@
+"""From environments and a policy to batches ``[N, T]``, and the state of both for a checkpoint."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import torch
+from tensordict.nn import TensorDictModuleBase
+from torchrl.collectors import Collector
+from torchrl.envs import EnvBase
+
+from egopose.collection.env_groups import LaneCollector
+from egopose.collection.lazy_rewards import Completion, GaussianSampler, draws_gaussian
+from egopose.collection.stepping import TransformedEgoPoseEnv
+from egopose.collection.workers import Workers, base_env, read_simulation, write_simulation
+from egopose.core.config import from_mapping
+from egopose.core.errors import InputError
+from egopose.core.runtime import prefer_quick_products
+
+__all__ = [
+    "CollectorSettings",
+    "base_env",
+    "build_collector",
+    "load_simulation_state",
+    "load_transform_state",
+    "set_threads",
+    "simulation_state",
+    "transform_state",
+]
+
+KINDS = ("sync", "multi_sync", "multi_async", "ray")
+
+
+@dataclass(frozen=True)
+class CollectorSettings:
+    """See ``conf/collector``.
+
+    Args:
+        kind: ``sync`` in this process; ``multi_sync`` and ``multi_async`` in processes, ``ray`` on machines of a Ray
+            cluster: see :class:`egopose.collection.workers.Workers`.
+        worlds: of one environment.
+        physics_threads: of one environment.
+        workers: processes, each with an environment of its own.
+        threads: torch threads while collecting; physics has threads of its own.
+        update_threads: torch threads while the networks are updated.
+        lanes: parts of the worlds of ``sync`` that take turns, see :class:`egopose.collection.env_groups.LaneCollector`; 1 to
+            step all at once, None for two from ``lanes_from`` steps of physics a control step on: below, taking turns
+            costs more than it hides.
+        lanes_from: see ``lanes``.
+        address: of the Ray cluster, see :class:`egopose.collection.workers.Workers`.
+    """
+
+    kind: str
+    worlds: int
+    physics_threads: int
+    workers: int
+    threads: int
+    update_threads: int
+    lanes: int | None = 1
+    lanes_from: int = 8
+    address: str | None = None
+
+    @classmethod
+    def from_config(cls, values: Mapping[str, Any], source: str = "conf/collector") -> CollectorSettings:
+        """Raises InputError: a key is missing, unknown or out of range."""
+        settings = from_mapping(cls, values, source)
+        if settings.kind not in KINDS:
+            raise InputError(source, "kind", f"must be one of {', '.join(KINDS)}, not {settings.kind!r}")
+        for name in ("worlds", "physics_threads", "workers", "threads", "update_threads", "lanes", "lanes_from"):
+            if (value := getattr(settings, name)) is not None and value < 1:
+                raise InputError(source, name, f"must be at least 1, not {value}")
+        if settings.lanes is not None and settings.lanes > settings.worlds:
+            raise InputError(source, "lanes", f"must be at most the worlds, {settings.worlds}, not {settings.lanes}")
+        return settings
+
+
+def build_collector(
+    settings: CollectorSettings,
+    make_env: Callable[[int], EnvBase],
+    policy: TensorDictModuleBase,
+    steps_per_iteration: int,
+) -> Collector | Workers:
+    """A collector that never ends; one iteration gives ``steps_per_iteration`` control steps over all worlds.
+
+    ``make_env`` gets the worker's number, to seed by. ``sync`` sets the environment to defer its rewards.
+
+    ``track_traj_ids=False`` and ``device=None`` because they are the quickest (measured; see docs/howto-bench.md).
+    """
+    prefer_quick_products()
+    if settings.kind == "sync":
+        env = make_env(0)
+        acting = GaussianSampler(policy) if draws_gaussian(policy) else policy
+        collector: Callable[..., Collector] = Collector
+        if isinstance(env, TransformedEgoPoseEnv):
+            env.defer_rewards()
+            if isinstance(acting, GaussianSampler) and acting.draws_from_entries():
+                lanes = settings.lanes or min(
+                    settings.worlds, 1 + (env.base_env.physics.substeps >= settings.lanes_from)
+                )
+                collector = partial(LaneCollector, lanes=lanes)
+        return collector(
+            env,
+            acting,
+            frames_per_batch=steps_per_iteration,
+            total_frames=-1,
+            track_traj_ids=False,
+            auto_register_policy_transforms=False,
+            postproc=Completion(env, acting),
+        )
+    return Workers(
+        settings.kind,
+        make_env,
+        policy,
+        workers=settings.workers,
+        worlds=settings.worlds,
+        steps_per_iteration=steps_per_iteration,
+        threads=settings.threads,
+        cpus=settings.physics_threads,
+        address=settings.address,
+    )
+
+
+def transform_state(collector: Any) -> Mapping[str, Any]:
+    """State of the environment's transforms: the normaliser's statistics of everything collected, by all workers."""
+    return collector.transforms if isinstance(collector, Workers) else collector.env.state_dict()
+
+
+def load_transform_state(collector: Any, state: Mapping[str, Any]) -> None:
+    """Set it, in every process. With workers, before the first batch only."""
+    if isinstance(collector, Workers):
+        collector.load_transform_state(state)
+    else:
+        collector.env.load_state_dict(state)
+
+
+def simulation_state(collector: Any) -> dict[str, Any]:
+    """Where every world stands: the base environment's own state and what the policy will see next.
+
+    With workers, of each at the end of its last batch.
+    """
+    if isinstance(collector, Workers):
+        return {f"worker{number}": state for number, state in enumerate(collector.simulation)}
+    return read_simulation(collector)
+
+
+def load_simulation_state(collector: Any, state: Mapping[str, Any]) -> None:
+    """The opposite of :func:`simulation_state`. With workers, before the first batch only.
+
+    Raises:
+        InputError: the environments do not take the state, being of another size or number.
+    """
+    try:
+        if isinstance(collector, Workers):
+            collector.load_simulation_state([state[f"worker{number}"] for number in range(len(state))])
+        else:
+            # Runs from before rewards were deferred kept the last step's terms among what the policy sees.
+            here = simulation_state(collector)["carrier"]
+            seen = {
+                key: value
+                for key, value in state["carrier"].items()
+                if key in here or not key.startswith("reward_terms.")
+            }
+            write_simulation(collector, {**state, "carrier": seen})
+    except (ValueError, KeyError, RuntimeError) as error:
+        raise InputError("simulation", "worlds", str(error)) from None
+
+
+def set_threads(count: int) -> None:
+    """Torch's threads inside an operator, from now on."""
+    if torch.get_num_threads() != count:
+        torch.set_num_threads(count)

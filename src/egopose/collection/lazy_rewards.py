@@ -1,0 +1,89 @@
+"""What acting does not need is worked out for a whole batch, not at every step while the physics' cores wait."""
+
+from __future__ import annotations
+
+from collections.abc import MutableMapping
+from typing import Any
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import (
+    ProbabilisticTensorDictSequential,
+    TensorDictModule,
+    TensorDictModuleBase,
+)
+from torchrl.envs import EnvBase
+from torchrl.modules import IndependentNormal
+
+from egopose.collection.stepping import TransformedEgoPoseEnv, parts_of, run_parts
+
+
+class GaussianSampler(TensorDictModuleBase):
+    """Draws a Gaussian actor's actions, the same ones from the same random numbers, without their probabilities.
+
+    Writes what the actor does but ``action_log_prob``, which :class:`Completion` adds.
+
+    Args:
+        actor: see :func:`draws_gaussian`.
+    """
+
+    def __init__(self, actor: ProbabilisticTensorDictSequential) -> None:
+        super().__init__()
+        self.actor = actor
+        self._network = actor.module[:-1]
+        self._parts = [part for step in self._network for part in parts_of(step)]
+        self.in_keys = actor.in_keys
+        self.out_keys = [key for key in actor.out_keys if key != "action_log_prob"]
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """``action [N, A]``, ``loc``, ``scale``."""
+        for part in self._network:
+            tensordict = part(tensordict)
+        return tensordict.set("action", torch.normal(tensordict["loc"], tensordict["scale"]))
+
+    def draws_from_entries(self) -> bool:
+        """Whether :meth:`act` can stand for :meth:`forward`: every part reads and writes plain entries."""
+        return all(
+            type(part) is TensorDictModule and all(isinstance(key, str) for key in (*part.in_keys, *part.out_keys))
+            for part in self._parts
+        )
+
+    def act(self, entries: MutableMapping[Any, Any]) -> None:
+        """:meth:`forward` on a plain mapping, at a third of its expense."""
+        run_parts(self._parts, entries)
+        entries["action"] = torch.normal(entries["loc"], entries["scale"])
+
+
+def draws_gaussian(policy: TensorDictModuleBase) -> bool:
+    """Whether ``policy`` is an actor as :func:`egopose.models.policy.build_actor` makes it, nothing behind it."""
+    return (
+        isinstance(policy, ProbabilisticTensorDictSequential)
+        and getattr(policy.module[-1], "distribution_class", None) is IndependentNormal
+        and "action_log_prob" in policy.out_keys
+    )
+
+
+class Completion:
+    """Adds to a collected batch ``[N, T]`` what was left out at its steps.
+
+    That is ``next/reward`` and ``next/reward_terms`` of an environment that defers them, and ``action_log_prob`` where
+    a :class:`GaussianSampler` acted.
+
+    Args:
+        env: the collector's.
+        policy: the collector's.
+    """
+
+    def __init__(self, env: EnvBase, policy: TensorDictModuleBase) -> None:
+        self._env = env.base_env if isinstance(env, TransformedEgoPoseEnv) else None
+        self._actor = policy.actor if isinstance(policy, GaussianSampler) else None
+
+    def __call__(self, batch: TensorDictBase) -> TensorDictBase:
+        batch = batch.copy()  # not of the tensors: the collector uses its own again
+        if self._env is not None:
+            terms = self._env.rewards_due()
+            batch["next", "reward"] = terms.pop("reward")
+            batch["next", "reward_terms"] = TensorDict(terms, batch_size=batch.batch_size)
+        if self._actor is not None:
+            batch["action_log_prob"] = self._actor.build_dist_from_params(batch).log_prob(batch["action"])
+        return batch

@@ -1,0 +1,63 @@
+"""``python -m egopose.report FOLDER [out=FILE] [key=value ...]``: one HTML page that holds everything it shows.
+
+FOLDER is one of `egopose evaluate`, or a sweep's (``hydra.sweep.dir``). Further words are overrides of
+conf/report.yaml. `egopose evaluate ... report=true` makes the same page of what it has just found.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from egopose.core.config import compose_config, from_mapping
+from egopose.core.errors import InputError
+from egopose.core.safe_io import read_json
+from egopose.evaluation.estimation_page import ReportSettings, write_report
+from egopose.evaluation.forecast_page import write_forecast_page
+from egopose.evaluation.sweep_report import SweepSettings, write_sweep_report
+from egopose.humanoid.model import HumanoidModel
+from egopose.inference.export import humanoid_for
+
+_SOURCE = "conf/report.yaml"
+
+
+def evaluation_report(folder: Path, humanoid: HumanoidModel | None, overrides: Sequence[str] = ()) -> Path:
+    """Write the page of an evaluation's folder: :func:`egopose.evaluation.estimation_page.write_report`'s, or of forecasts
+    :func:`egopose.evaluation.forecast_page.write_forecast_page`'s."""
+
+    config = compose_config("report", overrides)
+    settings = from_mapping(ReportSettings, config["evaluation"], f"{_SOURCE}: evaluation")
+    results = read_json(folder / "results.json", "results")
+    write = write_forecast_page if isinstance(results, dict) and "horizons_s" in results else write_report
+    return write(folder, humanoid, settings, _out(config, folder))
+
+
+def run_report(folder: Path, overrides: Sequence[str] = ()) -> Path:
+    """Write the page of whatever the folder is.
+
+    Raises:
+        InputError: it is neither an evaluation nor a sweep, or damaged; names it.
+    """
+
+    if not folder.is_dir():
+        cause = "is a file; give the folder of an evaluation or a sweep" if folder.exists() else "no such folder"
+        raise InputError(folder, "path", cause)
+    if (folder / "results.json").is_file():
+        try:
+            humanoid = humanoid_for(folder, "default")
+        except InputError as error:
+            print(f"no pictures: {error}", file=sys.stderr)
+            humanoid = None
+        return evaluation_report(folder, humanoid, overrides)
+    config = compose_config("report", overrides)
+    settings = from_mapping(SweepSettings, config["sweep"], f"{_SOURCE}: sweep")
+    return write_sweep_report(folder, settings, _out(config, folder))
+
+
+def _out(config: Mapping[str, Any], folder: Path) -> Path:
+    out = folder / "report.html" if config["out"] is None else Path(str(config["out"]))
+    if not out.parent.is_dir():
+        raise InputError(out, "out", f"no folder {out.parent}")
+    return out

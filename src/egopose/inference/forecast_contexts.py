@@ -1,0 +1,138 @@
+"""The states of the frames a forecast has seen, from three sources, none of which knows what comes after them.
+
+``regressor``: the state regressor on the context as a clip by itself. ``estimator``: an estimation policy that follows
+its own regressor through the context (Yuan & Kitani 2019, section 3.2: z_1 is from ego-pose estimation on V_{-f:0}).
+``reference``: the true states, as in training.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from egopose.checkpoint.checkpoint import find_checkpoint, read_json
+from egopose.core.errors import InputError
+from egopose.data.preparation import flow_name, store_folder
+from egopose.data.store import Fragment, TakeStore
+from egopose.data.windows import ForecastWindow
+from egopose.envs.mdp.observations import humanoid_state
+from egopose.envs.problem import TakeTable
+from egopose.inference.context_states import context_states
+from egopose.inference.estimator import estimate_takes
+from egopose.inference.failsafe import FailSafe, FailSafeSettings
+from egopose.inference.video_regression import require_estimation, run_folder, seen_in
+from egopose.models.predictions import Flow
+from egopose.motion.motion import finite_difference
+from egopose.motion.rotations import Array
+from egopose.pipeline.agent import Agent, load_agent
+from egopose.pipeline.regressor import load_regressor
+from egopose.pipeline.regressor_input import seen_in_store
+from egopose.tasks.dataset import Material
+
+SOURCES = ("regressor", "estimator", "reference")
+
+
+def past_states(
+    agent: Agent,
+    windows: Sequence[ForecastWindow],
+    source: str,
+    estimator: str | None = None,
+    failsafe: FailSafeSettings | None = None,
+    threads: int = 1,
+) -> Tensor:
+    """Humanoid states z ``[W, context, S]`` of the windows' contexts, float64.
+
+    Args:
+        agent: the forecasting run, whose state regressor ``regressor`` asks.
+        windows: W, all of one context.
+        source: one of :data:`SOURCES`.
+        estimator: run directory or checkpoint of an estimation policy, trained on the same store.
+        failsafe: of the estimator.
+        threads: of its physics.
+
+    Raises:
+        InputError: a regressor, estimator or the flow they read is not there or does not fit.
+    """
+    material, context = agent.material, windows[0].context
+    first = [int(material.takes.offsets[w.take]) + w.start for w in windows]
+    if source == "reference":
+        rows = torch.tensor(first)[:, None] + torch.arange(context)
+        states = humanoid_state({key: material.reference[key][rows.flatten()].double() for key in ("qpos", "qvel")})
+        return states.unflatten(0, rows.shape)
+    if source == "estimator":
+        if estimator is None or failsafe is None:
+            raise InputError("conf/evaluate.yaml", "forecast.estimator", "is missing: the run of an estimation policy")
+        return _estimated(agent, first, context, estimator, failsafe, threads)
+    if material.regressor is None:
+        raise InputError(agent.path, "regressor", "forecasts begin from the state regressor's state, and there is none")
+    model, made_with = load_regressor(material.regressor)
+    return context_states(model, _seen(agent, made_with), first, context).double()
+
+
+def _seen(agent: Agent, made_with: Mapping[str, Any]) -> Flow:
+    """What a regressor looks at of the store the agent was trained on."""
+    config = agent.config
+    return seen_in_store(config, made_with["regressor"], TakeStore.open(store_folder(config)), flow_name(config))
+
+
+def _estimated(
+    agent: Agent, first: Sequence[int], context: int, estimator: str, failsafe: FailSafeSettings, threads: int
+) -> Tensor:
+
+    checkpoint = find_checkpoint(estimator)
+    require_estimation(read_json(checkpoint, "config"), checkpoint)
+    model, made_with = load_regressor(run_folder(checkpoint) / "regressor")
+    flow, humanoid = _seen(agent, made_with), agent.material.humanoid
+    found = [seen_in(humanoid, model, np.asarray(flow[at : at + context]), made_with) for at in first]
+    seen = {key: torch.cat([clip[key] for clip in found]) for key in found[0]}
+    material = context_material(agent.material, first, context, seen)
+    policy = load_agent(checkpoint, material)
+    env = policy.make_env(worlds=len(first), threads=threads, whole_fragments=True, falls_end=False)
+    guard = FailSafe(len(first), failsafe.for_run(policy.config))
+    estimates = estimate_takes(env, policy.actor, policy.critic, policy.followed_states(), guard)
+    env.close()
+    clips = seen["humanoid_state"].double().unflatten(0, (len(first), context))
+    fps = 1.0 / humanoid.control_dt
+    return torch.stack([_states(e.qpos, e.resets, clip, fps) for e, clip in zip(estimates, clips, strict=True)])
+
+
+def _states(qpos: Array, resets: NDArray[np.bool_], regressed: Tensor, fps: float) -> Tensor:
+    """z ``[T, S]`` of an estimate ``[T, nq]``; velocities across a jump of the fail-safe are the regressor's."""
+    velocity = torch.from_numpy(finite_difference(qpos, fps))
+    states = humanoid_state({"qpos": torch.from_numpy(qpos), "qvel": velocity})
+    jumps = np.append(resets[1:], resets[-1:])  # differences go forward, and the last frame repeats the one before
+    after_angles = 5 + qpos.shape[1] - 7
+    states[jumps, after_angles:] = regressed[jumps, after_angles:]
+    return states
+
+
+def context_material(whole: Material, first: Sequence[int], context: int, seen: dict[str, Tensor]) -> Material:
+    """Each context as a take by itself, so that nothing an estimation policy reads reaches beyond it.
+
+    Args:
+        whole: of the store.
+        first: ``[W]`` global first frames.
+        context: frames.
+        seen: tables ``[W * context, ...]``, see :func:`egopose.inference.video_regression.seen_in`.
+    """
+    rows = (torch.tensor(first)[:, None] + torch.arange(context)).flatten()
+    reference = whole.reference[rows]
+    heads = torch.as_tensor(reference["xpos"])[:, whole.humanoid.head, 2].double()
+    pieces = [Fragment(number, 0, context) for number in range(len(first))]
+    offsets = context * torch.arange(len(first))
+    return Material(
+        whole.humanoid,
+        reference,
+        TakeTable(offsets, torch.full_like(offsets, context), heads.unflatten(0, (-1, context)).amin(dim=1)),
+        train=pieces,
+        test=pieces,
+        visual_features=seen["visual_features"],
+        visual_context=seen["visual_context"],
+        joint_targets=seen["joint_targets"],
+        states=seen["humanoid_state"],
+    )

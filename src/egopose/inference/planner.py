@@ -1,0 +1,263 @@
+"""Looking ahead in the simulator: of many ways to go on, each simulated for some frames, the body takes the best.
+
+The body that acts a video out is simulated anyway, so what an action leads to can be tried before it is taken
+(predictive sampling: Howell et al. 2022, arXiv 2212.00541; the policy's value at the horizon's end: Lowrey et al. 2019,
+POLO). A way to go on is the policy's mean action plus an addition that changes smoothly; the policy reacts in each.
+Chance alone rarely finds a way that is good in all joints, so later rounds try what lies between and about the best
+of those before (the cross-entropy method: Rubinstein 1999; in control: Chua et al. 2018, PETS).
+What they are judged by is what the body follows, the state regressor's motion or a kinematic forecast; the true motion
+plays no part.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from types import SimpleNamespace
+
+import numpy as np
+import torch
+from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBase
+from torch import Tensor
+from torchrl.envs import TransformedEnv
+
+from egopose.collection.stepping import Entries, parts_of, run_parts
+from egopose.core.errors import InputError
+from egopose.envs.env import EgoPoseEnv
+from egopose.envs.forecasting_transforms import RecurrentStates
+from egopose.envs.mdp.rewards import Reward, build_reward
+from egopose.envs.reference_forecasts import Futures
+from egopose.inference.planner_settings import PlannerSettings
+from egopose.models.pose_regression import state_to_qpos
+
+_EPISODE = ("take", "start", "stop", "frame")  # with one number for each body
+Rows = Callable[[Mapping[str, Tensor]], Tensor]
+"""Of what an environment writes: which row of what is followed each body should be in, ``[N]`` int64."""
+
+_PARTS = (0.25, 0.5, 0.75)  # of the best way, tried in later rounds
+_ELITES = (2, 4, 8)  # ways whose means are tried
+_NARROWED = 0.5  # of the additions' deviation, about the mean of the second of these
+_BROKEN = 1000.0  # what a way loses whose physics break: more than any sum of rewards
+
+
+def global_frame(entries: Mapping[str, Tensor]) -> Tensor:
+    """The row of a table of all frames."""
+    return entries["frame"].squeeze(-1)
+
+
+def followed_futures(futures: Futures, starts: Tensor) -> tuple[Tensor, Rows]:
+    """What bodies follow that follow the forecasts from these frames.
+
+    Args:
+        futures: forecasts.
+        starts: ``[W]`` global frames, each once.
+
+    Returns:
+        States z ``[W * (horizon + 1), S]`` of every step, and the rows of a body in its episode; behind the horizon the
+        last.
+    """
+    steps = torch.arange(futures.horizon + 1)
+    states = futures.states(starts.repeat_interleave(len(steps)), steps.repeat(len(starts)))
+    number = torch.full((futures.frames,), -1, dtype=torch.int64)
+    number[starts] = torch.arange(len(starts))
+
+    def row(entries: Mapping[str, Tensor]) -> Tensor:
+        start, step = entries["episode_start"].squeeze(-1), entries["episode_step"].squeeze(-1)
+        return number[start] * len(steps) + step.clamp(max=futures.horizon)
+
+    return states, row
+
+
+class Planner:
+    """Plans for N bodies side by side; a copy of each tries ``samples`` ways.
+
+    Args:
+        env: of ``N * samples`` worlds like those that are planned for, falls not ending an episode, its normaliser
+            frozen.
+        actor, critic: policy and value network, in evaluation mode; sequences of modules that read and write plain
+            entries.
+        states: ``[R, 2 nq - 3]`` the humanoid states the policy follows: the regressor's of every global frame, or
+            :func:`followed_futures`.
+        settings: see :class:`PlannerSettings`.
+        row: which of them.
+
+    Attributes:
+        value: ``[N]`` what the best way was worth: discounted rewards and, at the horizon, V; nothing for a body that
+            lies where what is followed stands.
+
+    Raises:
+        InputError: actions are torques, the policy has a memory, or no hinge is named.
+    """
+
+    def __init__(
+        self,
+        env: TransformedEnv,
+        actor: TensorDictModuleBase,
+        critic: TensorDictModuleBase,
+        states: Tensor,
+        settings: PlannerSettings,
+        row: Rows = global_frame,
+    ) -> None:
+        base = env.base_env
+        assert isinstance(base, EgoPoseEnv)
+        problem, humanoid = base.problem, base.problem.humanoid
+        if problem.action.kind != "pd":
+            raise InputError(
+                "planner", "action", "a planner moves targets of PD controllers, not torques: planner=none"
+            )
+        if any(isinstance(part, RecurrentStates) for part in env.transform):
+            raise InputError("planner", "model.memory", "a planner's ways begin without a memory: planner=none")
+        self.settings, self._env, self._base, self._row = settings, env, base, row
+        # The mean is what a deterministic policy does: no need of the distribution behind it.
+        gaussian = isinstance(actor, ProbabilisticTensorDictSequential)
+        self._actor = [part for step in (actor.module[:-1] if gaussian else [actor]) for part in parts_of(step)]
+        self._action, self._critic = "loc" if gaussian else "action", parts_of(critic)
+        self._reward: Reward = build_reward(settings.reward)
+        env.reset()
+        self._followed, self._head_height = self._what_is_followed(states)
+        hinges = [joint.name for joint in humanoid.skeleton.joints for _ in joint.dofs]
+        chosen = [float(any(part in name for part in settings.joints)) for name in hinges]
+        if not any(chosen):
+            raise InputError("planner", "joints", f"none of {', '.join(settings.joints)} is part of a hinge's name")
+        self._deviation = settings.deviation * torch.tensor(chosen)
+        self._generator = torch.Generator().manual_seed(settings.seed)
+        worlds = base.batch_size[0] // settings.samples
+        self._plan = torch.zeros(worlds, settings.horizon + settings.every, len(hinges))
+        self._age = 0
+        self._worth, self.value = torch.zeros(worlds), torch.zeros(worlds)
+
+    def _what_is_followed(self, states: Tensor) -> tuple[dict[str, Tensor], Tensor]:
+        """What the reward reads of the regressor's bodies, and their heads' height ``[F]`` m.
+
+        They stand at the origin and face along x: nothing in the heading frame depends on it.
+        """
+        problem, worlds = self._base.problem, self._base.batch_size[0]
+        views: list[dict[str, Tensor]] = []
+        heights = []
+        for rows in states.split(worlds):
+            facing = np.array([1.0, 0.0, 0.0, 0.0])
+            qpos, qvel = state_to_qpos(rows.double().numpy(), np.zeros(2), facing, problem.humanoid.joint_range)
+            self._base.place(torch.arange(len(rows)), torch.from_numpy(qpos), torch.from_numpy(qvel))
+            body = problem.view(self._base.body_state()[: len(rows)])
+            views.append({name: getattr(body, name) for name in self._reward.reads})
+            heights.append(body.xpos[:, problem.humanoid.head, 2])
+        return {name: torch.cat([view[name] for view in views]) for name in self._reward.reads}, torch.cat(heights)
+
+    def addition(self, base: EgoPoseEnv) -> Tensor:
+        """``[N, nu]`` to add to the policy's mean action now, in the state of ``base`` (N worlds); planned anew where
+        it is time to."""
+        if self._age % self.settings.every == 0:
+            self._look_ahead(base)
+        self._age += 1
+        head = torch.as_tensor(base.body_state()["xpos"])[:, base.problem.humanoid.head, 2]
+        low = self._head_height[self._row(base.observe())] - head > self.settings.lost
+        self.value = torch.where(low, 0.0, self._worth)
+        now = self._plan[:, 0].clone()
+        self._plan = self._plan.roll(-1, 1)
+        self._plan[:, -1] = 0.0
+        return now
+
+    def forget(self, worlds: Tensor) -> None:
+        """``worlds [n]`` were placed elsewhere: what was planned for them, and their value, hold no more."""
+        self._plan[worlds], self._age = 0.0, 0
+
+    def _additions(self, count: int, wider: float = 1.0) -> Tensor:
+        """``[count, N, H, nu]`` additions drawn anew, straight lines between their knots."""
+        settings, (worlds, _, size) = self.settings, self._plan.shape
+        knots = -(-(settings.horizon - 1) // settings.knot) + 1
+        at_knots = torch.randn(count, worlds, knots, size, generator=self._generator) * (wider * self._deviation)
+        at_knots *= 0.1 + 0.9 * torch.rand(count, worlds, 1, 1, generator=self._generator)
+        time = torch.arange(settings.horizon) / settings.knot
+        left = time.long().clamp(max=max(knots - 2, 0))
+        share = (time - left)[:, None]
+        return torch.lerp(at_knots[:, :, left], at_knots[:, :, (left + 1).clamp(max=knots - 1)], share)
+
+    def _ways(self) -> Tensor:
+        """``[K, N, H, nu]``: none, the plan so far, changes of it, and ways of their own."""
+        ways, plan = self._additions(self.settings.samples), self._plan[:, : self.settings.horizon]
+        ways[: self.settings.samples // 2] += plan
+        ways[0], ways[1] = 0.0, plan
+        return ways
+
+    def _refined(self, ways: Tensor, score: Tensor, wider: float = 1.0) -> Tensor:
+        """``[K, N, H, nu]`` between and about the best of ``ways``, as many or more, by their ``score [>= K, N]``.
+
+        Parts of the best, or of its change of the plan so far, means of the best ones, and the rest about such a mean.
+        """
+        best = ways[score.topk(min(max(_ELITES), len(ways)), dim=0).indices, torch.arange(ways.shape[1])]
+        plan, means = ways[1], [best[:count].mean(0) for count in _ELITES]
+        found = [way for part in _PARTS for way in (torch.lerp(plan, best[0], part), part * best[0])]
+        found += [way for mean in means for way in (mean, 0.5 * mean, torch.lerp(plan, mean, 0.5))]
+        found = found[: self.settings.samples]
+        about = means[1] + _NARROWED * self._additions(self.settings.samples - len(found), wider)
+        return torch.cat([torch.stack(found), about])
+
+    @torch.no_grad()
+    def _look_ahead(self, base: EgoPoseEnv) -> None:
+        settings, now = self.settings, base.state_dict()
+        ways = self._ways()
+        score, worth, low = self._tried(now, ways)
+        worlds = torch.arange(ways.shape[1])
+        for number in range(settings.rounds - 1 + settings.rescue):
+            rescue = number - (settings.rounds - 1)
+            if rescue < 0:
+                more = self._refined(ways, score)
+            elif not (low[score.argmax(0), worlds] > settings.sinking).any():
+                break
+            else:  # what balances a body does not catch one that falls
+                wide = settings.wider
+                more = self._refined(ways, score, wide) if rescue % 2 else self._additions(settings.samples, wide)
+            tried = self._tried(now, more)
+            pairs = zip((ways, score, worth, low), (more, *tried), strict=True)
+            ways, score, worth, low = (torch.cat(pair) for pair in pairs)
+        most, change = score.amax(0), (ways - ways[1]).square().mean((2, 3))
+        best = torch.where(score >= most - settings.near, change, torch.inf).argmin(0)
+        # Chance finds small gains in any noise; to follow each of them is to tremble.
+        enough = most - settings.margin
+        best = torch.where(score[0] >= enough, 0, torch.where(score[1] >= enough, 1, best))
+        self._worth = worth[best, worlds]
+        self._plan[:, : settings.horizon] = ways[best, worlds]
+
+    def _tried(self, now: Mapping[str, Tensor], ways: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """What ``ways [K, N, H, nu]`` come to ``[K, N]`` from the bodies' state ``now``.
+
+        Returns:
+            Rewards less the price of how they are come by; rewards alone; and by how many metres the head ends lower
+            than what is followed has it.
+        """
+        settings, copies, problem = self.settings, self._base, self._base.problem
+        self._copy(now)
+        seen = Entries(self._env.transform(copies.observe()).items())
+        worth = torch.zeros(copies.batch_size[0])
+        cost, low = torch.zeros_like(worth), torch.zeros_like(worth)
+        before, rate, kept = copies.physics.qvel.copy(), 1.0 / problem.humanoid.control_dt, 1.0
+        for step in range(settings.horizon):
+            run_parts(self._actor, seen)
+            body, after = copies.try_step(seen[self._action] + ways[:, :, step].flatten(0, 1))
+            row = self._row(after)
+            followed = SimpleNamespace(**{name: rows.index_select(0, row) for name, rows in self._followed.items()})
+            reward, _ = self._reward(body, followed, after["episode_step"].squeeze(-1))
+            low = (self._head_height[row] - body.xpos[:, problem.humanoid.head, 2]).clamp(min=0.0)
+            velocity = body.qvel.numpy()
+            acceleration = torch.from_numpy(np.abs(velocity - before).mean(1) * rate)
+            before = velocity
+            worth += kept * reward.float()
+            cost += kept * (settings.acceleration * acceleration + settings.head * low).float()
+            cost += _BROKEN * after["diverged"].squeeze(-1)
+            kept *= settings.discount
+            seen = self._env.transform._step(seen, Entries(after))
+        run_parts(self._critic, seen)
+        worth += kept * seen["state_value"].squeeze(-1)
+        score, worth, low = (rows.unflatten(0, ways.shape[:2]) for rows in (worth - cost, worth, low.float()))
+        return score, worth, low
+
+    def _copy(self, state: Mapping[str, Tensor]) -> None:
+        """Put every body's copies where the body is, in ``state`` of its environment."""
+        samples = self.settings.samples
+        own = self._base.state_dict()
+        own |= {name: state[name].repeat(samples) for name in _EPISODE}
+        own |= {name: state[name].repeat(samples, 1) for name in ("physics.state", "placed") if name in state}
+        self._base.load_state_dict(own)
+
+    def close(self) -> None:
+        """Stop the copies' physics."""
+        self._env.close()

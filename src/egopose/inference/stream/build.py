@@ -1,0 +1,310 @@
+"""``python -m egopose.stream source=0|VIDEO|ADDRESS|take:NAME checkpoint=RUN``: motion, live, and forecasts of it."""
+
+from __future__ import annotations
+
+import contextlib
+import gc
+import threading
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import torch
+from tensordict.nn import TensorDictModuleBase
+from torchrl.envs import TransformedEnv
+
+from egopose.checkpoint.checkpoint import find_checkpoint, read_json
+from egopose.core.config import from_mapping
+from egopose.core.errors import InputError
+from egopose.data.preparation import humanoid_of, store_folder
+from egopose.data.store import TakeStore
+from egopose.humanoid.model import HumanoidModel
+from egopose.inference.causal import CausalRegression
+from egopose.inference.failsafe import FailSafeSettings
+from egopose.inference.stream.forecasting import ForecastThread
+from egopose.inference.stream.frame_features import Sight
+from egopose.inference.stream.frame_sources import ReconnectSettings, SourceSettings, check_source
+from egopose.inference.stream.latency import LatencyTable
+from egopose.inference.stream.live_body import LiveBody
+from egopose.inference.stream.live_forecasts import STAGES, ForecastSettings, LiveFutures, Moment
+from egopose.inference.stream.loop import STAGES, LiveLoop, LoopSettings
+from egopose.inference.stream.outputs import check_outputs, open_outputs
+from egopose.inference.video_regression import causal_regression, run_folder, seen_in, video_material
+from egopose.models.regressor import StateRegressor
+from egopose.pipeline.agent import load_agent
+from egopose.pipeline.forecaster import ForecastCurves, still_futures
+from egopose.pipeline.regressor import load_regressor
+from egopose.pipeline.regressor_input import finder_of, load_finder_of, planes_of
+from egopose.tasks.dataset import Material
+from egopose.vision.flow import FlowConfig
+from egopose.vision.lens import Camera
+
+_CONFIG = "conf/stream.yaml"
+
+
+@dataclass(frozen=True)
+class Trained:
+    """What a run brings to a stream.
+
+    Args:
+        humanoid: the run's.
+        regressor: in eval mode.
+        made_with: the groups ``vision`` and ``regressor``.
+        env: one world, on a take of two frames.
+        actor, critic: in eval mode.
+        config: of the run, resolved.
+    """
+
+    humanoid: HumanoidModel
+    regressor: StateRegressor
+    made_with: Mapping[str, Any]
+    env: TransformedEnv
+    actor: TensorDictModuleBase
+    critic: TensorDictModuleBase
+    config: Mapping[str, Any]
+
+
+def load_trained(checkpoint: str, which: str) -> Trained:
+    """A run's networks, ready for a stream.
+
+    Raises:
+        InputError: it cannot be used; names the field.
+    """
+
+    folder = find_checkpoint(checkpoint, which)
+    config = read_json(folder, "config")
+    humanoid = humanoid_of(config)
+    regressor, made_with = load_regressor(run_folder(folder) / "regressor")
+    agent = load_agent(folder, still_frames(humanoid, regressor, made_with))
+    env = agent.make_env("test", worlds=1, threads=1, whole_fragments=True, falls_end=False)
+    return Trained(humanoid, regressor, made_with, env, agent.actor, agent.critic, config)
+
+
+@dataclass(frozen=True)
+class Forecaster:
+    """What a forecasting run brings to a stream.
+
+    Args:
+        env: ``1 + drawn futures`` worlds, on a take of still frames.
+        actor, regressor: in eval mode.
+        seen: planes and both sides of what its encoder sees of a frame.
+        settings: of the stream's forecasts.
+        curves: of a policy that follows kinematic forecasts.
+    """
+
+    env: TransformedEnv
+    actor: TensorDictModuleBase
+    regressor: StateRegressor
+    seen: tuple[int, int, int]
+    settings: ForecastSettings
+    curves: ForecastCurves | None = None
+
+
+def forecast_settings(values: Mapping[str, Any]) -> ForecastSettings:
+    """The group ``forecast`` of ``conf/stream.yaml``, resolved.
+
+    Raises:
+        InputError: a value that cannot be.
+    """
+
+    beside = ("checkpoint", "which", "out")
+    chosen = {name: value for name, value in values["forecast"].items() if name not in beside}
+    return from_mapping(ForecastSettings, chosen, f"{_CONFIG}: forecast")
+
+
+def load_forecaster(values: Mapping[str, Any], trained: Trained) -> Forecaster | None:
+    """The forecasting policy ``forecast.checkpoint`` names, for the body of ``trained``; None where it names none.
+
+    Raises:
+        InputError: it cannot be used, or is of another body or another flow than the estimating run's.
+    """
+
+    settings, checkpoint = forecast_settings(values), values["forecast"]["checkpoint"]
+    if checkpoint is None:
+        return None
+    folder = find_checkpoint(str(checkpoint), str(values["forecast"]["which"]))
+    config = read_json(folder, "config")
+    task = config["task"]
+    follows = config.get("forecaster") is not None
+    if task.get("context") is None or not (follows or config["model"]["context"]["source"] == "past"):
+        cause = "a live forecast is one of `egopose train experiment=forecasting`, or `forecasting_follow`"
+        cause += "; name such a run, or null for none"
+        raise InputError(folder, "task", f"this run's is {task['name']}: {cause}")
+    humanoid = humanoid_of(config)
+    if humanoid.skeleton != trained.humanoid.skeleton or humanoid.control_dt != trained.humanoid.control_dt:
+        raise InputError(folder, "humanoid", "another body than the estimating run's: train both with one humanoid")
+    regressor, made_with = load_regressor(run_folder(folder) / "regressor")
+    flows = ({**dict(made["vision"]["flow"]), "workers": 1} for made in (made_with, trained.made_with))
+    if len({tuple(sorted(flow.items())) for flow in flows}) > 1:
+        raise InputError(folder, "vision.flow", "another flow than the estimating run's: train both with one vision")
+    if finder_of(made_with["regressor"]) != finder_of(trained.made_with["regressor"]):
+        cause = "another limb finder than the estimating run's: train both with one regressor"
+        raise InputError(folder, "regressor.kernel.limbs", cause)
+    material = still_frames(humanoid, regressor, made_with, task["context"] + task["minimum"])
+    curves = None
+    if follows:
+        material = still_futures(config, material)
+        curves = ForecastCurves(config, material, run_folder(folder))
+    agent = load_agent(folder, material)
+    env = agent.make_env("test", worlds=1 + settings.drawn, threads=1, whole_fragments=True, falls_end=False)
+    size = int(made_with["vision"]["flow"]["stored_size"])
+    seen = (planes_of(made_with["regressor"]), size, size)
+    return Forecaster(env, agent.actor, regressor, seen, settings, curves)
+
+
+def still_frames(
+    humanoid: HumanoidModel, regressor: StateRegressor, made_with: Mapping[str, Any], frames: int = 2
+) -> Material:
+    """The material of a take of still frames: what an environment needs to be made before anything is seen."""
+
+    size = int(made_with["vision"]["flow"]["stored_size"])
+    still = np.zeros((frames, planes_of(made_with["regressor"]), size, size), np.float16)
+    return video_material(humanoid, seen_in(humanoid, regressor, still, made_with), "stream")[0]
+
+
+def build_loop(
+    values: Mapping[str, Any], trained: Trained, source: SourceSettings, forecaster: Forecaster | None = None
+) -> LiveLoop:
+    """The loop of ``conf/stream.yaml``, resolved, on a run's networks, with forecasts beside it where there are any.
+
+    Raises:
+        InputError: a setting is wrong.
+    """
+
+    for name, least in (("threads", 1), ("opencv_threads", 1), ("lookahead", 0), ("bridge", 0), ("latency_frames", 1)):
+        if not isinstance(values[name], int) or values[name] < least:
+            raise InputError(_CONFIG, name, f"must be a whole number of at least {least}, not {values[name]!r}")
+    torch.set_num_threads(values["threads"])
+    cv2.setNumThreads(values["opencv_threads"])
+    failsafe = from_mapping(FailSafeSettings, values["failsafe"], f"{_CONFIG}: failsafe").for_run(trained.config)
+    limits = {name: values[name] for name in ("seconds", "bridge")}
+    settings = from_mapping(LoopSettings, limits, _CONFIG)
+    flow = FlowConfig(**dict(trained.made_with["vision"]["flow"]))
+    camera = Camera.from_mapping(values["camera"], "camera")
+    rate = 1.0 / trained.humanoid.control_dt
+    latency = LatencyTable(STAGES, values["latency_frames"])
+
+    def parts(lap: Callable[[str], None]) -> tuple[Sight, CausalRegression, LiveBody]:
+        """As at the start: nothing seen yet."""
+        task, lookahead = trained.config["task"], values["lookahead"]
+        return (
+            Sight(trained.regressor, flow, camera, rate, load_finder_of(trained.made_with["regressor"])),
+            causal_regression(trained.humanoid, trained.regressor, trained.made_with, task, lookahead),
+            LiveBody(trained.env, trained.actor, trained.critic, failsafe, lap),
+        )
+
+    warm_up(*parts(lambda stage: None))
+    beside = None if forecaster is None else _forecasts(values, forecaster, failsafe.fallen_height, rate)
+    return LiveLoop(source, *parts(latency.lap), latency, rate, settings, beside)
+
+
+def _forecasts(values: Mapping[str, Any], forecaster: Forecaster, fallen_height: float, rate: float) -> ForecastThread:
+    """The thread, not yet begun, whose parts have done their work once."""
+
+    settings = forecaster.settings
+    every = max(round(settings.every * rate), 1)
+    capacity = max(values["latency_frames"] // every, 1)
+    latency = LatencyTable(STAGES, capacity, ("forecast", "forecast_delay"))
+
+    made = forecaster
+    futures = LiveFutures(made.env, made.actor, made.regressor, settings, fallen_height, made.curves)
+    humanoid = forecaster.env.base_env.problem.humanoid
+    still = np.zeros((futures.context, *forecaster.seen), np.float32)
+    standing = humanoid.skeleton.rest_qpos()
+    standing[2] = 1.0
+    futures.roll(Moment(0, standing, np.zeros(humanoid.mj_model.nv), still, time.perf_counter()))
+    return ForecastThread(futures, every, values["lookahead"], latency, values["pace"] == "every")
+
+
+def warm_up(sight: Sight, regression: CausalRegression, body: LiveBody) -> None:
+    """Let all parts do their work on a still picture: the first time takes a hundred times as long."""
+
+    still = np.zeros((64, 64, 3), np.uint8)
+    poses = frame = 0
+    while poses < 3:
+        seen = regression.push(frame, sight.features(sight.flow(still, frame / 30)))
+        frame += 1
+        if seen is not None:
+            body.advance(seen)
+            poses += 1
+
+
+def source_settings(values: Mapping[str, Any], config: Mapping[str, Any] | None = None) -> SourceSettings:
+    """What ``source`` names; ``take:NAME`` is the rendered video of a take in the store of a run's ``config``.
+
+    Raises:
+        InputError: no such take or file, a file that is no video, an address of an unknown kind.
+    """
+
+    given = {name: values[name] for name in ("pace", "repeat", "offset")}
+    given["reconnect"] = from_mapping(ReconnectSettings, values["reconnect"], f"{_CONFIG}: reconnect")
+    given["fps"] = Camera.from_mapping(values["camera"], "camera").fps
+    settings = from_mapping(SourceSettings, {**given, "source": str(values["source"])}, _CONFIG)
+    if settings.source.startswith("take:"):
+        if config is None:
+            return settings
+        path, offset = take_video(config, settings.source.removeprefix("take:"))
+        settings = replace(settings, source=str(path), offset=settings.offset + offset)
+    check_source(settings)
+    return settings
+
+
+def take_video(config: Mapping[str, Any], name: str) -> tuple[Path, float]:
+    """The video of a take in the store of a run's ``config``, and its sync offset (s).
+
+    Raises:
+        InputError: the store is not prepared or has no such take; names what there is.
+    """
+
+    store = TakeStore.open(store_folder(config))
+    names = [take.name for take in store.takes]
+    if name not in names:
+        raise InputError("stream", "source", f"no take {name!r}; there are {', '.join(names)}")
+    number = names.index(name)
+    return store.video(number), store.takes[number].sync_offset
+
+
+def stream(values: Mapping[str, Any], stop: threading.Event | None = None) -> dict[str, Any]:
+    """The whole way of ``conf/stream.yaml``, resolved, until the source ends or ``stop`` is set.
+
+    Returns:
+        The last status, see :meth:`LiveLoop.status`.
+
+    Raises:
+        InputError: source, run or setting cannot be used; names it.
+    """
+
+    check_outputs(values)
+    source_settings(values)
+    trained = load_trained(str(values["checkpoint"]), str(values["which"]))
+    forecaster = load_forecaster(values, trained)
+    source = source_settings(values, trained.config)
+    loop = build_loop(values, trained, source, forecaster)
+    with contextlib.ExitStack() as stack:
+        forecast = None if forecaster is None else forecaster.settings
+        sinks = open_outputs(values, trained.humanoid, source, forecast, stack)
+        settle_memory()
+        last = loop.run(sinks.on_pose, sinks.on_status, stop, sinks.on_forecast)
+        sinks.on_status({**last, "end": True})
+    return last
+
+
+def settle_memory() -> None:
+    """What was loaded stays: the collector need not walk over it while frames come."""
+    gc.collect()
+    gc.freeze()
+
+
+def print_report(status: Mapping[str, Any]) -> None:
+    """Counts and the latency table, to standard output."""
+    counts = ["poses", "used", "dropped", "surplus", "bridged", "lost", "resets", "reconnects"]
+    counts += ["forecasts", "forecasts_skipped"]
+    words = (f"{status[name]} {name.replace('_', ' ')}" for name in counts)
+    print(f"{status['seconds']:.1f} s, " + ", ".join(words))
+    print(f"{'stage':16s} {'p50 ms':>8s} {'p95 ms':>8s} {'p99 ms':>8s}")
+    for stage, row in status["stages"].items():
+        print(f"{stage:16s} " + " ".join(f"{row[key]:8.2f}" for key in ("p50_ms", "p95_ms", "p99_ms")))

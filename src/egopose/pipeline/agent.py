@@ -1,0 +1,110 @@
+"""From the resolved configuration to the objects it names; the one place where the rooms meet.
+
+The way of training: store of takes -> state regressor's tables -> environment -> networks -> PPO.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from tensordict.nn import TensorDictModuleBase
+from torchrl.envs import TransformedEnv
+
+from egopose.checkpoint.checkpoint import RunCheckpoint, find_checkpoint, read_json, require, verify
+from egopose.core.errors import InputError
+from egopose.envs.transforms import StateNormalizer
+from egopose.pipeline.dataset import run_material
+from egopose.pipeline.environment import build_env
+from egopose.pipeline.forecaster import with_futures
+from egopose.pipeline.networks import build_networks
+from egopose.tasks.dataset import Material, smoothed
+
+_STORE_GROUPS = {"data", "humanoid"}
+
+
+@dataclass(frozen=True)
+class Agent:
+    """A trained policy and what it was trained on.
+
+    Attributes:
+        actor, critic: in evaluation mode.
+        config: resolved, of its run.
+        material: see :class:`Material`.
+        make_env: ``make_env(split="test", worlds=1, ...)`` as :func:`build_env`, with the normaliser as trained and
+            frozen.
+        path: the checkpoint.
+    """
+
+    actor: TensorDictModuleBase
+    critic: TensorDictModuleBase
+    config: dict[str, Any]
+    material: Material
+    make_env: Callable[..., TransformedEnv]
+    path: Path
+
+    def followed_states(self) -> torch.Tensor:
+        """``[F, S]`` humanoid states of the regressor as the policy follows them, smoothed as ``task.action`` says.
+
+        Raises:
+            InputError: there is no regressor.
+        """
+        states = smoothed(self.material, float(self.config["task"]["action"].get("smoothing", 0.0))).states
+        if states is None:
+            raise InputError(self.path, "regressor", "the policy starts from the state regressor, and there is none")
+        return states
+
+
+def load_agent(
+    path: str | Path, material: Material | None = None, which: str = "best", overrides: Mapping[str, Any] | None = None
+) -> Agent:
+    """Networks and environment from a checkpoint.
+
+    Args:
+        path: a checkpoint folder or a run directory.
+        material: to run on; None for the data its configuration names, seen by the run's own state regressor.
+        which: of a run directory, the ``best`` or the ``latest`` checkpoint.
+        overrides: whole config groups in place of the run's own (``{"data": {...}}``).
+
+    Raises:
+        InputError: the checkpoint is damaged, or does not fit the material; the run was trained on other data, or its
+            state regressor is gone; names the field.
+    """
+    folder = find_checkpoint(path, which)
+    metadata = verify(folder)
+    own = read_json(folder, "config")
+    config = {**own, **(overrides or {})}
+    if material is None:
+        same_store = not _other_store(own, config)
+        material = run_material(config, folder.resolve().parent.parent, same_store)
+    material = with_futures(config, material, folder.resolve().parent.parent)
+    env = build_env(config, material, worlds=1)
+    require(metadata, folder, task=str(config["task"]["name"]), action_size=int(env.action_spec.shape[-1]))
+    actor, critic = build_networks(config, material, env)
+    RunCheckpoint({"policy": actor, "critic": critic, "transforms": env}).restore(folder)
+    statistics = copy.deepcopy(env.state_dict())
+    env.close()
+
+    def make_env(split: str = "test", *, worlds: int = 1, **options: Any) -> TransformedEnv:
+        made = build_env(config, material, split, worlds=worlds, **options)
+        made.load_state_dict(statistics)
+        for module in made.transform.modules():
+            if isinstance(module, StateNormalizer):
+                module.freeze()
+        return made
+
+    return Agent(actor.eval(), critic.eval(), config, material, make_env, folder)
+
+
+def _other_store(own: Mapping[str, Any], config: Mapping[str, Any]) -> bool:
+    """Whether ``config`` asks for other data than a run's own, and not for the same that lies elsewhere by now."""
+
+    def parts(one: Mapping[str, Any]) -> list[Any]:
+        place = dict.fromkeys(("folder", "store"))
+        return [{**one[group], **place} if group == "data" else one[group] for group in sorted(_STORE_GROUPS)]
+
+    return bool(parts(own) != parts(config))

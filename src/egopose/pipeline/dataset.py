@@ -1,0 +1,101 @@
+"""What a policy is trained on and judged by: everything that comes from data, none of it learned by PPO."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+
+from egopose.data.preparation import fingerprint_of, flow_name, humanoid_of, prepare
+from egopose.data.splits import split_takes
+from egopose.data.store import TakeStore
+from egopose.envs.mdp.observations import humanoid_state
+from egopose.pipeline.regressor import kept_tables, regressor_tables
+from egopose.tasks.dataset import Material, require_same_store, take_table
+
+
+def load_material(config: Mapping[str, Any], progress: bool = True) -> Material:
+    """The material ``config`` names: data prepared and state regressor trained where that has not been done yet.
+
+    Raises:
+        InputError: data cannot be found or used, the split leaves nothing, or a setting is wrong.
+    """
+    store = prepare(config, progress=progress)
+    return _with_tables(config, store, *regressor_tables(config, store, humanoid_of(config), flow_name(config)))
+
+
+def run_material(config: Mapping[str, Any], run: Path, same_store: bool = True, progress: bool = True) -> Material:
+    """The material of a trained run, seen by the run's own state regressor ``run/regressor``; nothing is trained.
+
+    Args:
+        config: the run's, resolved. Its data is prepared where that has not been done yet.
+        run: the run directory.
+        same_store: whether the data must be what the run was trained on; False for data of another set.
+        progress: show bars.
+
+    Raises:
+        InputError: as :func:`load_material`; the data is not the run's, or neither run nor store holds a regressor.
+    """
+    if same_store:
+        # Before anything is prepared: hours could pass, only to be refused.
+        require_same_store(run, fingerprint_of(config))
+    store = prepare(config, progress=progress)
+    tables = kept_tables(config, store, humanoid_of(config), flow_name(config), run / "regressor")
+    return _with_tables(config, store, *tables)
+
+
+def _with_tables(config: Mapping[str, Any], store: TakeStore, tables: TensorDictBase, weights: Path) -> Material:
+    return replace(
+        _motion_of(config, store),
+        visual_features=tables["visual_features"],
+        visual_context=tables["visual_context"],
+        joint_targets=tables["joint_targets"],
+        states=tables["humanoid_state"],
+        regressor=weights,
+        store_fingerprint=store.fingerprint,
+    )
+
+
+def motion_material(config: Mapping[str, Any], context_size: int = 128) -> Material:
+    """For measuring speed without any video: noise for context, the reference's own states and joint angles.
+
+    Raises:
+        InputError: as :func:`load_material`.
+    """
+    motion = _motion_of(config, prepare(config, progress=False, flow=False))
+    noise = torch.randn(len(motion.reference), context_size, generator=torch.Generator().manual_seed(0))
+    return replace(
+        motion,
+        visual_features=noise,
+        visual_context=noise,
+        joint_targets=motion.reference["qpos"][:, 7:].float(),
+        states=humanoid_state(motion.reference).float(),
+    )
+
+
+def _motion_of(config: Mapping[str, Any], store: TakeStore) -> Material:
+    split = config["data"]["split"]
+    train, test = (split_takes(store.takes, split, part) for part in ("train", "test"))
+    return Material(humanoid_of(config), store.reference, take_table(store.takes), train, test)
+
+
+def absolute_paths(config: dict[str, Any]) -> dict[str, Any]:
+    """The configuration with the files of ``data`` named from the root, so that a run can be resumed from anywhere."""
+    data = dict(config["data"])
+    for key in ("folder", "store"):
+        if data.get(key):
+            data[key] = _absolute(data[key])
+    if data.get("takes"):
+        data["takes"] = [
+            {key: _absolute(value) if key in ("motion", "video") and value else value for key, value in take.items()}
+            for take in data["takes"]
+        ]
+    return {**config, "data": data}
+
+
+def _absolute(path: str) -> str:
+    return str(Path(path).expanduser().resolve())

@@ -1,0 +1,274 @@
+"""From a configuration to the kinematic forecasts a policy follows: trained once a run, kept in ``RUN_DIR/forecaster``.
+
+Forecasts that begin at training frames are those of networks that have not seen the frames around them, nor any they
+forecast: a policy must not trust them more than it may on new takes.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from egopose.checkpoint.checkpoint import ComponentState, RunCheckpoint, has_component, metadata_of
+from egopose.core.errors import InputError
+from egopose.data.preparation import flow_name, global_spans, store_folder
+from egopose.data.spans import Span, cross_fit_blocks, group_blocks
+from egopose.data.splits import split_takes
+from egopose.data.store import TakeStore
+from egopose.data.windows import ForecastWindow
+from egopose.envs.mdp.observations import humanoid_state
+from egopose.envs.reference_forecasts import Futures
+from egopose.humanoid.foot_geometry import out_of_floor
+from egopose.inference.forecaster import placed_states
+from egopose.models.mirror import state_mirror
+from egopose.models.motion_forecast import ContinuedForecaster, KernelForecaster, MotionForecaster, spline_basis
+from egopose.pipeline.agent import Agent
+from egopose.pipeline.regressor import training_contexts
+from egopose.tasks.dataset import Material
+from egopose.training.continued_forecast import (
+    blank_continued_forecaster,
+    continued_share,
+    fit_continued_forecaster,
+)
+from egopose.training.fitting import FitSettings, fit
+from egopose.training.kernel_forecast import Contexts, blank_kernel_forecaster, fit_kernel_forecaster
+from egopose.training.motion_forecast import ForecasterSettings, ForecastLearner, build_forecaster, cross_fit_starts
+
+FOLDER = "forecaster"
+#: Components of that folder that forecasts are made by; ``futures`` are those of the training frames.
+PARTS = ("members", "kernel", "sizes", "continued")
+
+
+@dataclass(frozen=True)
+class Members:
+    """A forecaster's parts: ``(1 - share) * mean of the networks' curves + share * the kernel's``, and of each
+    coefficient of that a share ``[K, 1]`` of the one that goes on frame by frame."""
+
+    networks: list[MotionForecaster]
+    kernel: KernelForecaster | None = None
+    share: float = 0.0
+    continued: ContinuedForecaster | None = None
+    continued_share: Tensor | None = None
+
+
+def with_futures(config: Mapping[str, Any], material: Material, run: Path) -> Material:
+    """The material with the run's forecasts, trained where that has not been done.
+
+    Itself where the run has no forecaster, or the material has forecasts already.
+
+    Args:
+        config: resolved; its group ``forecaster`` says how, or is null.
+        material: with the states a regressor sees.
+        run: the run directory.
+
+    Raises:
+        InputError: a setting is wrong, there are no regressed states, or what is kept is damaged.
+    """
+    if config.get("forecaster") is None or material.futures is not None:
+        return material
+    settings, _ = _settings(config)
+    folder = run / FOLDER
+    if not folder.is_dir():
+        _train(config, material, folder)
+    saved: dict[str, Tensor] = {}
+    if has_component(folder, "futures"):
+        RunCheckpoint({"futures": ComponentState(dict, saved.update)}).restore(folder, {"futures"})
+    else:  # shipped without those of its training frames: others are put in where a forecast begins
+        assert material.states is not None
+        knots, size = spline_basis(settings.horizon + 1, settings.spacing, _fps(material))[0].shape[1], _size(material)
+        saved = {"coefficients": torch.zeros(0, knots, size), "starts": torch.zeros(0, dtype=torch.int64)}
+    return replace(material, futures=_futures(material, settings, saved["coefficients"], saved["starts"]))
+
+
+def begin_forecasts(agent: Agent, windows: Sequence[ForecastWindow], pasts: Tensor) -> tuple[Tensor, Tensor]:
+    """Where forecasts of ``windows`` begin: ``qpos [W, nq]`` and ``qvel [W, nv]``, placed where the reference is, feet
+    out of the floor.
+
+    That is the last state of ``pasts [W, context, S]``; where the agent follows kinematic forecasts, it is where those
+    begin, and from now on the agent follows, from these frames, the ones that have seen ``pasts`` alone.
+    """
+    material = agent.material
+    now = torch.tensor([int(material.takes.offsets[w.take]) + w.now for w in windows])
+    where = torch.as_tensor(material.reference["qpos"][now]).double()
+    humanoid = material.humanoid
+    if material.futures is None:
+        return placed_states(pasts[:, -1].numpy(), where.numpy(), humanoid)
+    curves = ForecastCurves(agent.config, material, agent.path.resolve().parent.parent)
+    material.futures.put(curves(pasts), now)
+    qpos, qvel = material.futures.first_state(now, where, humanoid.joint_range)
+    return torch.from_numpy(out_of_floor(humanoid, qpos.numpy())), qvel
+
+
+def still_futures(config: Mapping[str, Any], material: Material) -> Material:
+    """The material with forecasts of a body that stays as it is in the first frame."""
+    assert material.states is not None
+    settings, _ = _settings(config)
+    knots = spline_basis(settings.horizon + 1, settings.spacing, _fps(material))[0].shape[1]
+    # The splines add up to one everywhere.
+    frames = len(material.reference)
+    curves = material.states[:1, None, : _size(material)].expand(frames, knots, -1)
+    return replace(material, futures=_futures(material, settings, curves, torch.arange(frames)))
+
+
+class ForecastCurves:
+    """A run's forecaster: from states seen ``[W, context, S]`` to a curve's coefficients ``[W, K, P]``.
+
+    Args:
+        config: of the run, resolved.
+        material: of its humanoid, with the states a regressor sees.
+        run: the run directory.
+
+    Attributes:
+        context: frames it sees.
+
+    Raises:
+        InputError: what is kept in the run is damaged or not there.
+    """
+
+    def __init__(self, config: Mapping[str, Any], material: Material, run: Path) -> None:
+        settings, _ = _settings(config)
+        self.context, self._size = settings.context, _size(material)
+        self._members = _members(settings, run / FOLDER, self._size, _fps(material))
+
+    def __call__(self, pasts: Tensor) -> Tensor:
+        return _curves(self._members, pasts[..., : self._size].float())
+
+
+def _settings(config: Mapping[str, Any]) -> tuple[ForecasterSettings, FitSettings]:
+    values = {key: value for key, value in config["forecaster"].items() if key != "optimiser"}
+    return ForecasterSettings.from_config(values), FitSettings.from_config(config["forecaster"]["optimiser"])
+
+
+def _size(material: Material) -> int:
+    """P: numbers of a humanoid state that are its pose and not its joints' velocities."""
+    assert material.states is not None
+    return 11 + (material.states.shape[1] - 11) // 2
+
+
+def _fps(material: Material) -> float:
+    return 1.0 / material.humanoid.control_dt
+
+
+def _futures(material: Material, settings: ForecasterSettings, coefficients: Tensor, starts: Tensor) -> Futures:
+    frames = len(material.reference)
+    return Futures(coefficients, starts, frames, settings.horizon, settings.spacing, _fps(material))
+
+
+@torch.no_grad()
+def _curves(members: Members, contexts: Tensor) -> Tensor:
+    """Curve of the members ``[W, K, P]`` from contexts ``[W, C, P]``, in the pose's own units."""
+    return torch.cat([_curve(members, part) for part in contexts.split(512)])
+
+
+def _curve(members: Members, contexts: Tensor) -> Tensor:
+    def of(member: MotionForecaster | KernelForecaster | ContinuedForecaster) -> Tensor:
+        return member((contexts - member.mean) / member.std) * member.std + member.mean
+
+    curve = torch.stack([of(network) for network in members.networks]).mean(0)
+    if members.kernel is not None:
+        curve = torch.lerp(curve, of(members.kernel), members.share)
+    if members.continued is None or members.continued_share is None:
+        return curve
+    return torch.lerp(curve, of(members.continued), members.continued_share)
+
+
+def _train(config: Mapping[str, Any], material: Material, folder: Path) -> None:
+    """Fit all networks; write ``folder`` whole or not at all."""
+    if material.states is None:
+        raise InputError("configuration", "forecaster", "needs a trained state regressor")
+    settings, optimiser = _settings(config)
+    store = TakeStore.open(store_folder(config))
+    pieces = split_takes(store.takes, config["data"]["split"], "train", supported_only=False)
+    spans = [Span(*span) for span in global_spans(store, pieces)]
+    size = _size(material)
+    truth = humanoid_state(material.reference).float()[:, :size]
+    # No shorter than the least context: a stretch without one has nothing to say.
+    ends = [torch.arange(s.start + settings.context - 1, s.stop) for s in spans]
+    starts = torch.cat([torch.zeros(0, dtype=torch.int64), *ends])
+    rows = training_contexts(config, store, material.humanoid, flow_name(config), starts, settings.context)[..., :size]
+    seen = Contexts.at(rows, starts, len(truth))
+    mirror = state_mirror(material.humanoid.skeleton).poses()
+    hands, seed, fps = [int(d) for d in material.humanoid.hand_dofs], int(config["seed"]), _fps(material)
+
+    def members(fragments: Sequence[Span], label: str) -> Members:
+        out: list[MotionForecaster] = []
+        for number in range(settings.members):
+            share = optimiser.validation_share
+            draw = seed * 1000 + number
+            learner = ForecastLearner(
+                seen, truth, fragments, mirror, hands, settings, fps, optimiser.batch, share, draw
+            )
+            result = fit(learner, optimiser, draw, settings.total_frames)
+            print(
+                f"forecaster{label} {number}: held out E_pose {result.held_out:.3f} after {result.frames} frames",
+                file=sys.stderr,
+                flush=True,
+            )
+            out.append(learner.model)
+        made = Members(out)
+        if settings.kernel is not None:
+            kernel = fit_kernel_forecaster(seen, truth, fragments, mirror, settings, fps)
+            made = replace(made, kernel=kernel, share=settings.kernel.share)
+        if settings.continued is not None:
+            continued, result = fit_continued_forecaster(truth, fragments, mirror, settings, fps, seed)
+            print(
+                f"forecaster{label}, frame by frame: held out {result.held_out:.3f} after {result.frames} frames",
+                file=sys.stderr,
+                flush=True,
+            )
+            made = replace(made, continued=continued, continued_share=continued_share(settings))
+        return made
+
+    blocks = cross_fit_blocks(spans, settings.cross_fit)
+    if config["data"]["split"]["kind"] == "subject":
+        blocks = group_blocks(spans, [store.takes[piece.take].subject for piece in pieces], settings.cross_fit)
+    whole = members(spans, "")
+    coefficients, begun = [], []
+    for fold, (others, now) in enumerate(cross_fit_starts(spans, blocks, settings)):
+        if len(now):
+            fitted = members(others, f" without block {fold}")
+            coefficients.append(_curves(fitted, seen[now]))
+            begun.append(now)
+    table = {"coefficients": torch.cat(coefficients), "starts": torch.cat(begun)}
+    part = folder.with_name(f"{FOLDER}.part")
+    shutil.rmtree(part, ignore_errors=True)
+    made: dict[str, Any] = {"members": nn.ModuleList(whole.networks)}
+    made["futures"] = ComponentState(lambda: table, lambda _: None)
+    if whole.kernel is not None:
+        sizes = {"centres": torch.tensor(len(whole.kernel.kernel.centres))}
+        made["kernel"], made["sizes"] = whole.kernel, ComponentState(lambda: sizes, lambda _: None)
+    if whole.continued is not None:
+        made["continued"] = whole.continued
+    RunCheckpoint(made).save(part, metadata=metadata_of("motion forecaster", size, 0, 0, 0.0))
+    os.replace(part, folder)
+
+
+def _members(settings: ForecasterSettings, folder: Path, size: int, fps: float) -> Members:
+    zero, one = torch.zeros(size), torch.ones(size)
+    networks = [build_forecaster(settings, zero, one, fps, 0) for _ in range(settings.members)]
+    parts: dict[str, Any] = {"members": nn.ModuleList(networks)}
+    kernel, continued = None, None
+    if settings.kernel is not None:
+        sizes: dict[str, Tensor] = {}
+        RunCheckpoint({"sizes": ComponentState(dict, sizes.update)}).restore(folder, {"sizes"})
+        kernel = parts["kernel"] = blank_kernel_forecaster(settings, zero, one, fps, int(sizes["centres"]))
+    if settings.continued is not None:
+        continued = parts["continued"] = blank_continued_forecaster(settings, zero, one, fps)
+    RunCheckpoint(parts).restore(folder, set(parts))
+    for part in parts.values():
+        part.eval()
+    return Members(
+        networks,
+        kernel,
+        0.0 if settings.kernel is None else settings.kernel.share,
+        continued,
+        None if settings.continued is None else continued_share(settings),
+    )

@@ -1,0 +1,141 @@
+"""From the resolved configuration to the objects it names; the one place where the rooms meet.
+
+The way of training: store of takes -> state regressor's tables -> environment -> networks -> PPO.
+"""
+
+from __future__ import annotations
+
+import copy
+import random
+from collections.abc import Mapping
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from tensordict.nn import TensorDictModuleBase
+from torchrl.envs import TransformedEnv
+
+from egopose.collection.collectors import CollectorSettings, build_collector, transform_state
+from egopose.core.errors import InputError
+from egopose.core.runtime import settle_heap
+from egopose.envs.aids import Aids
+from egopose.envs.mdp.observations import humanoid_state
+from egopose.models.recurrent import collecting_policy
+from egopose.pipeline.environment import build_env
+from egopose.pipeline.networks import build_networks
+from egopose.tasks.dataset import Material
+from egopose.training.adversarial import AdversarialPPO, DiscriminatorSettings
+from egopose.training.exploration import SigmaSchedule, sigma_buffers
+from egopose.training.loop import Evaluation, LoopSettings, Run, interrupts_held
+from egopose.training.ppo import PPO, PPOSettings
+from egopose.training.survival import frames_survived
+
+_LOOP_IN_ALGO = ("iterations", "steps_per_iteration")
+
+
+_LOOP_IN_TRAINING = ("total_steps", "max_seconds", "checkpoint_every", "keep_last", "evaluate_every")
+
+
+def build_run(config: Mapping[str, Any], folder: Path, material: Material) -> Run:
+    """The run ``config`` describes, not yet begun.
+
+    Raises:
+        InputError: a setting is missing, unknown or out of range.
+    """
+    algo, training = dict(config["algo"]), config["training"]
+    loop = {name: algo.pop(name, ...) for name in _LOOP_IN_ALGO}
+    loop |= {name: training.get(name, ...) for name in _LOOP_IN_TRAINING}
+    settings = LoopSettings.from_config(loop)
+    material.keep_regressor(folder)
+    material.keep_provenance(folder)
+    collector_settings = CollectorSettings.from_config(config["collector"])
+    ppo_settings = PPOSettings.from_config(algo)
+
+    for seed in (torch.manual_seed, random.seed, np.random.seed):
+        seed(int(config["seed"]) % 2**32)
+    probe = build_env(config, material, worlds=1)
+    actor, critic = build_networks(config, material, probe)
+    action_size = int(probe.action_spec.shape[-1])
+    probe.close()
+    sigma = _sigma_schedule(config, actor)
+    with interrupts_held():
+        collector = build_collector(
+            collector_settings,
+            partial(_training_env, config, material, collector_settings, folder),
+            collecting_policy(actor, critic),
+            settings.steps_per_iteration,
+        )
+    if "discriminator" in algo:
+        ppo: PPO = _adversarial(config, material, actor, critic, ppo_settings)
+    else:
+        ppo = PPO(actor, critic, ppo_settings)
+    settle_heap()
+    return Run(ppo, collector, settings, collector_settings, folder, config, action_size, sigma)
+
+
+def _sigma_schedule(config: Mapping[str, Any], actor: TensorDictModuleBase) -> SigmaSchedule | None:
+    """As ``aids.sigma`` says, None for a sigma that stays."""
+    settings = Aids.from_config(config.get("aids")).sigma
+    if settings is None:
+        return None
+    if config["model"]["learn_sigma"]:
+        raise InputError("configuration", "aids.sigma", "is for a fixed sigma, and model.learn_sigma is true")
+    return SigmaSchedule(sigma_buffers(actor), settings.sigma, float(config["model"]["sigma"]), settings.steps)
+
+
+def _adversarial(
+    config: Mapping[str, Any],
+    material: Material,
+    actor: TensorDictModuleBase,
+    critic: TensorDictModuleBase,
+    settings: PPOSettings,
+) -> AdversarialPPO:
+    """VGAIL's learner: the discriminator's examples are the reference's states on the training frames."""
+    if material.visual_context is None or config["model"]["context"]["source"] != "frozen":
+        raise InputError("configuration", "model.context.source", "a discriminator needs frozen visual context")
+    offsets = material.takes.offsets
+    frames = torch.cat([torch.arange(f.start, f.stop) + offsets[f.take] for f in material.train])
+    states = humanoid_state(material.reference[frames]).float()
+    discriminator = DiscriminatorSettings.from_config(config["algo"]["discriminator"])
+    contexts, floor = torch.as_tensor(material.visual_context[frames]), float(config["regressor"]["std_floor"])
+    return AdversarialPPO(actor, critic, settings, discriminator, states, contexts, floor)
+
+
+def _training_env(
+    config: Mapping[str, Any], material: Material, settings: CollectorSettings, folder: Path, worker: int
+) -> TransformedEnv:
+    return build_env(
+        config,
+        material,
+        worlds=settings.worlds,
+        threads=settings.physics_threads,
+        seed=int(config["seed"]) * 1000 + worker,
+        dump_dir=folder / "diverged",
+        aids=Aids.from_config(config.get("aids")),
+        workers=1 if settings.kind == "sync" else settings.workers,
+    )
+
+
+def build_evaluation(run: Run, material: Material) -> Evaluation:
+    """A look at the mean action while training: frames survived on the test fragments, from starts that stay the same.
+
+    Its ``score`` is the mean number of frames survived.
+    """
+    config = run.config
+    training = config["training"]
+    env = build_env(
+        config,
+        material,
+        "test",
+        worlds=int(training["evaluation_worlds"]),
+        threads=int(config["collector"]["physics_threads"]),
+    )
+
+    def evaluate(iteration: int) -> dict[str, float]:
+        env.load_state_dict(transform_state(run.collector))
+        survival = frames_survived(env, copy.deepcopy(run.ppo.actor), int(training["evaluation_seed"]))
+        return {"score": survival.mean, "falls": float(survival.fell.double().mean())}
+
+    return evaluate
