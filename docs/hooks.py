@@ -97,7 +97,7 @@ def notebook_page(notebook: dict[str, Any]) -> str:
                 parts.append(f'<img alt="the plot made by the lines above" src="data:image/png;base64,{picture}">')
             elif text := "".join(output.get("text", data.get("text/plain", ""))):
                 parts.append(f"```text\n{text.rstrip()}\n```")
-    parts.append("The notebook itself is `docs/notebooks/first_look.ipynb`; it is run by `tests/test_docs.py`.")
+    parts.append("The notebook itself is `docs/notebooks/first_look.ipynb`; it is run by `tests/core/test_docs.py`.")
     return "\n\n".join(parts)
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from egopose.core.runtime import prefer_quick_products
+from egopose.core.torch_settings import prefer_quick_products
 
 SHARED = Path(__file__).resolve().parents[1].parent / "shared"
 

@@ -20,17 +20,18 @@ from typing import Any
 
 from egopose.core.config import compose_config, from_mapping
 from egopose.core.errors import InputError
+from egopose.core.result_files import write_json
 from egopose.core.safe_io import read_yaml
 from egopose.data.preparation import flow_name, store_folder
 from egopose.data.store import TakeStore
 from egopose.evaluation.agents import evaluate_agent
+from egopose.evaluation.baseline_scores import score_motions
 from egopose.evaluation.protocols import ContactSettings, fragment_names, raw_figures
-from egopose.evaluation.tables import write_json
 from egopose.inference.failsafe import FailSafeSettings
 from egopose.inference.planner_settings import planner_settings
 from egopose.models.baselines.path_pose import PathPose
 from egopose.pipeline.agent import load_agent
-from egopose.pipeline.baselines import load_baseline, path_pose_motion, score_motions
+from egopose.pipeline.baselines import load_baseline, path_pose_motion
 from egopose.pipeline.dataset import run_material
 from egopose.vision.corruption import Corruption
 

@@ -20,8 +20,8 @@ import numpy as np
 
 from egopose.core.errors import InputError
 from egopose.core.safe_io import read_json
-from egopose.evaluation.report import RENDERED_NOTE
 from egopose.evaluation.statistics import ratio_interval
+from egopose.inference.outputs import RENDERED_NOTE
 from egopose.motion.rotations import Array
 
 HERE = Path(__file__).resolve().parent

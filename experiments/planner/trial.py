@@ -21,7 +21,7 @@ import numpy as np
 from egopose.core.atomic_write import write_text_whole
 from egopose.core.config import compose_config, from_mapping
 from egopose.core.safe_io import read_yaml
-from egopose.envs.starts import FragmentLike
+from egopose.data.fragments import FragmentLike
 from egopose.evaluation.agents import FragmentResult, evaluate_agent
 from egopose.evaluation.protocols import ContactSettings
 from egopose.inference.failsafe import FailSafeSettings

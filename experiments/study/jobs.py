@@ -14,25 +14,26 @@ from study import Job
 
 from egopose.baseline import run_baseline_job
 from egopose.core.config import compose_config, from_mapping
+from egopose.core.result_files import write_json
 from egopose.data.preparation import flow_name, store_folder
 from egopose.data.store import TakeStore
 from egopose.data.windows import ForecastWindow, forecast_windows
 from egopose.evaluation.agents import evaluate_agent
+from egopose.evaluation.baseline_scores import score_motions
 from egopose.evaluation.forecast_metrics import score_forecasts, true_futures
 from egopose.evaluation.forecast_run import ForecastSettings, forecast_windows_of, windows_of
 from egopose.evaluation.protocols import ContactSettings, fragment_names, raw_figures
-from egopose.evaluation.tables import write_json
 from egopose.inference.context_states import context_states
 from egopose.inference.failsafe import FailSafeSettings
 from egopose.inference.forecast_contexts import past_states
+from egopose.inference.forecast_start import begin_forecasts
 from egopose.inference.planner_settings import planner_settings
 from egopose.models.baselines.path_pose import PathPose
 from egopose.models.baselines.recurrent import RecurrentForecaster
 from egopose.motion.rotations import Array
 from egopose.pipeline.agent import Agent, load_agent
-from egopose.pipeline.baselines import forecast_qpos, load_baseline, path_pose_motion, regressed_motion, score_motions
+from egopose.pipeline.baselines import forecast_qpos, load_baseline, path_pose_motion, regressed_motion
 from egopose.pipeline.dataset import absolute_paths, load_material, run_material
-from egopose.pipeline.forecaster import begin_forecasts
 from egopose.pipeline.regressor import load_regressor
 from egopose.pipeline.regressor_input import seen_in_store
 from egopose.pipeline.training import run_job as train_job

@@ -19,10 +19,10 @@ from typing import Any
 import numpy as np
 
 from egopose.core.errors import InputError
+from egopose.core.result_files import write_json
 from egopose.core.safe_io import read_json
-from egopose.evaluation.report import RENDERED_NOTE
 from egopose.evaluation.statistics import Interval, mean_interval, ratio_interval
-from egopose.evaluation.tables import write_json
+from egopose.inference.outputs import RENDERED_NOTE
 from egopose.motion.rotations import Array
 
 HERE = Path(__file__).resolve().parent

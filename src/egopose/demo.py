@@ -10,9 +10,6 @@ from __future__ import annotations
 import sys
 
 from egopose.core.errors import InputError
-from egopose.evaluation.demo import run_demo
-
-_BUDGETS = {"full": "demo", "short": "demo_short"}
 
 
 def main() -> None:
@@ -21,6 +18,8 @@ def main() -> None:
     if any(word in ("-h", "--help") for word in words):
         print(__doc__)
         return
+    from egopose.evaluation.demo import run_demo
+
     budget = next((word.removeprefix("budget=") for word in words if word.startswith("budget=")), "full")
     try:
         run_demo(budget, [word for word in words if not word.startswith("budget=")])

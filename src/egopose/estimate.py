@@ -3,21 +3,18 @@
 from __future__ import annotations
 
 import sys
-from typing import TYPE_CHECKING
 
 from omegaconf import DictConfig
 
 from egopose.core.config import command, resolved
 from egopose.core.errors import InputError
 
-if TYPE_CHECKING:
-    pass
-from egopose.inference.video import estimate_video
-
 
 @command("estimate")
 def main(config: DictConfig) -> None:
     """Hydra's entry."""
+    from egopose.inference.video import estimate_video
+
     try:
         estimate_video(resolved(config))
     except InputError as error:

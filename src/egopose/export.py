@@ -9,14 +9,9 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from egopose.core.config import check_arguments, compose_config
 from egopose.core.errors import InputError
-
-if TYPE_CHECKING:
-    pass
-from egopose.inference.export import run_export
 
 
 def main() -> None:
@@ -25,6 +20,8 @@ def main() -> None:
     if not words or any(word in ("-h", "--help") for word in words):
         print(__doc__)
         raise SystemExit(0 if words else 2)
+    from egopose.inference.export import run_export
+
     sources = [word for word in words if "=" not in word]
     files = [word.removeprefix("to=") for word in words if word.startswith("to=")]
     overrides = [word for word in words if "=" in word and not word.startswith("to=")]

@@ -8,14 +8,9 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from egopose.core.config import check_arguments
 from egopose.core.errors import InputError
-
-if TYPE_CHECKING:
-    pass
-from egopose.evaluation.reports import run_report
 
 
 def main() -> None:
@@ -24,6 +19,8 @@ def main() -> None:
     if not words or any(word in ("-h", "--help") for word in words):
         print(__doc__)
         raise SystemExit(0 if words else 2)
+    from egopose.evaluation.reports import run_report
+
     folders = [word for word in words if "=" not in word]
     try:
         check_arguments(words)

@@ -5,21 +5,18 @@ from __future__ import annotations
 import signal
 import sys
 import threading
-from typing import TYPE_CHECKING
 
 from omegaconf import DictConfig
 
 from egopose.core.config import command, resolved
 from egopose.core.errors import InputError
 
-if TYPE_CHECKING:
-    pass
-from egopose.inference.stream.build import print_report, stream
-
 
 @command("stream")
 def main(config: DictConfig) -> None:
     """Hydra's entry."""
+    from egopose.inference.stream.build import print_report, stream
+
     stop = threading.Event()
     # Not an exception out of nowhere: what was seen so far is to be written whole.
     for number in (signal.SIGINT, signal.SIGTERM):

@@ -3,39 +3,18 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
 
 from omegaconf import DictConfig
 
 from egopose.core.config import command, resolved
 from egopose.core.errors import InputError
 
-if TYPE_CHECKING:
-    from egopose.data.sync import Sync
-
-
-def run_sync(config: Mapping[str, Any]) -> Sync:
-    """The way of ``conf/sync.yaml``, resolved.
-
-    Raises:
-        InputError: video, motion or a setting cannot be used, or no offset stands out; says what to do then.
-    """
-    from egopose.data.sync import settings_of, sync_offset
-    from egopose.motion.io import read_motion
-    from egopose.vision.flow import FlowConfig
-    from egopose.vision.lens import Camera
-
-    camera = Camera.from_mapping(config["data"]["camera"], "data.camera")
-    motion = read_motion(str(config["motion"]), **config["reader"])
-    flow = FlowConfig(**config["vision"]["flow"])
-    settings = settings_of(config["data"])
-    return sync_offset(str(config["video"]), motion, settings, flow, camera, dict(config["mapping"]))
-
 
 @command("sync")
 def main(config: DictConfig) -> None:
     """Hydra's entry."""
+    from egopose.data.sync import run_sync
+
     try:
         found = run_sync(resolved(config))
     except InputError as error:

@@ -8,22 +8,13 @@ Words key=value are overrides of conf/sync.yaml (the camera), for `--offset auto
 from __future__ import annotations
 
 import argparse
-import secrets
 import signal
 import sys
 import threading
 from collections.abc import Sequence
-from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from egopose.core.errors import InputError
-
-if TYPE_CHECKING:
-    from egopose.viewer.live import LiveViewer
-
-
-_LIVE = ("ws://", "wss://")
 
 
 def _offset(word: str) -> float | None:
@@ -32,10 +23,6 @@ def _offset(word: str) -> float | None:
         return None if word == "auto" else float(word)
     except ValueError:
         raise argparse.ArgumentTypeError(f"must be seconds or `auto`, not {word!r}") from None
-
-
-def _is_source(word: str) -> bool:
-    return word.startswith(_LIVE) or Path(word).exists()
 
 
 def command_line() -> argparse.ArgumentParser:
@@ -56,35 +43,11 @@ def command_line() -> argparse.ArgumentParser:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Command line; serves until it is interrupted."""
-    options = command_line().parse_args(arguments)
+    from egopose.viewer.session import open_viewer
+
+    given = command_line().parse_args(arguments)
     try:
-        if find_spec("viser") is None:
-            raise InputError("view", "viser", "is not installed; pip install 'egopose[view]'")
-        from egopose.viewer.app import Viewer
-        from egopose.viewer.auth_proxy import Address
-        from egopose.viewer.clip import Footage
-        from egopose.viewer.clip_sources import read_runs
-        from egopose.vision.video import probe_video
-
-        overrides = [word for word in options.sources if "=" in word and not _is_source(word)]
-        sources = [word for word in options.sources if word not in overrides]
-        if not sources:
-            raise InputError("view", "source", "none is named: a motion file, an evaluation, a run or ws:// address")
-        token = secrets.token_hex(16) if options.token == "new" else options.token
-        address = Address(options.address, options.port, token)
-        find_sync = options.offset is None
-        footage = None if options.video is None else Footage(options.video, options.offset or 0.0)
-        viewer: Viewer | LiveViewer
-        if sources[0].startswith(_LIVE):
-            from egopose.viewer.live import LiveViewer
-
-            if len(sources) > 1:
-                raise InputError("view", "source", "a live stream is shown by itself; name nothing beside it")
-            viewer = LiveViewer(sources[0], address)
-        else:
-            if footage is not None:
-                probe_video(footage.path)
-            viewer = Viewer(read_runs(sources, footage), address, find_sync, overrides)
+        viewer = open_viewer(given.sources, given.video, given.offset, given.address, given.port, given.token)
     except InputError as error:
         print(f"error: {error}", file=sys.stderr)
         raise SystemExit(2) from None

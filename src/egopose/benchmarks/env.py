@@ -5,10 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from egopose import pipeline
 from egopose.benchmarks.raw_replay import compare_with_raw
 from egopose.collection.collectors import CollectorSettings, base_env, build_collector, set_threads
+from egopose.core.config import compose_config
 from egopose.core.runtime import settle_heap
+from egopose.pipeline.dataset import motion_material
+from egopose.pipeline.environment import build_env
+from egopose.pipeline.networks import build_networks
 
 
 def run(overrides: Sequence[str], rounds: int) -> dict[str, Any]:
@@ -28,12 +31,12 @@ def run(overrides: Sequence[str], rounds: int) -> dict[str, Any]:
         InputError: a setting is unknown or out of range.
     """
 
-    config = pipeline.compose_config("train", ["sim=paper", *overrides])
-    material = pipeline.motion_material(config)
+    config = compose_config("train", ["sim=paper", *overrides])
+    material = motion_material(config)
     settings = CollectorSettings.from_config(config["collector"])
     set_threads(settings.threads)
-    env = pipeline.build_env(config, material, worlds=settings.worlds, threads=settings.physics_threads)
-    actor, _ = pipeline.build_networks(config, material, env)
+    env = build_env(config, material, worlds=settings.worlds, threads=settings.physics_threads)
+    actor, _ = build_networks(config, material, env)
     collector = build_collector(settings, lambda _: env, actor, int(config["algo"]["steps_per_iteration"]))
     settle_heap()
     try:

@@ -16,12 +16,13 @@ from typing import Any
 
 import torch
 
-from egopose import pipeline
 from egopose.checkpoint.checkpoint import read_json
 from egopose.collection.collectors import transform_state
 from egopose.collection.workers import Workers
+from egopose.pipeline.dataset import motion_material
 from egopose.pipeline.training import run_job
 from egopose.training import loop
+from egopose.training.ppo import PPO
 
 #: What a training is doing; ``load`` is taking over a checkpoint.
 PHASES = ("start", "load", "collect", "update", "save")
@@ -72,7 +73,7 @@ def train_or_go_on(config: dict[str, Any], folder: Path, number: int) -> None:
     server: Any = multiprocessing.forkserver._forkserver
     server.ensure_running = lambda: None
     _observe(Notes(folder.with_suffix(NOTES)), number)
-    run_job(config, folder, pipeline.motion_material(config))
+    run_job(config, folder, motion_material(config))
 
 
 def _observe(notes: Notes, number: int) -> None:
@@ -105,7 +106,7 @@ def _observe(notes: Notes, number: int) -> None:
     module.iterate = iterate
     module.Run.restore = restore
     before(loop, "iterate", "collect")
-    before(loop.PPO, "advantages", "update")
+    before(PPO, "advantages", "update")
     before(loop.Run, "save", "save")
     before(loop.Run, "restore", "load")
 

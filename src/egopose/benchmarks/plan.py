@@ -9,12 +9,15 @@ from typing import Any
 
 import torch
 
-from egopose import pipeline
 from egopose.benchmarks.raw_replay import RawReplay, StepRecorder
+from egopose.core.config import compose_config
 from egopose.envs.mdp.observations import humanoid_state
-from egopose.inference.estimator import prepare_for_test
+from egopose.envs.test_time import prepare_for_test
 from egopose.inference.planner import Planner
 from egopose.inference.planner_settings import planner_settings
+from egopose.pipeline.dataset import motion_material
+from egopose.pipeline.environment import build_env
+from egopose.pipeline.networks import build_networks
 
 
 def run(overrides: Sequence[str], rounds: int) -> dict[str, Any]:
@@ -36,16 +39,16 @@ def run(overrides: Sequence[str], rounds: int) -> dict[str, Any]:
     """
 
     ours = [word for word in overrides if word.startswith("planner.")]
-    config = pipeline.compose_config("train", ["sim=fast", *(word for word in overrides if word not in ours)])
-    settings = planner_settings(pipeline.compose_config("evaluate", ["checkpoint=none", *ours])["planner"])
+    config = compose_config("train", ["sim=fast", *(word for word in overrides if word not in ours)])
+    settings = planner_settings(compose_config("evaluate", ["checkpoint=none", *ours])["planner"])
     assert settings is not None  # the default is a planner, and only its values change here
     threads = int(config["collector"]["physics_threads"])
     torch.set_num_threads(1)
-    material = pipeline.motion_material(config)
+    material = motion_material(config)
     options: dict[str, Any] = {"threads": threads, "whole_fragments": True, "falls_end": False}
-    env = pipeline.build_env(config, material, worlds=1, **options)
-    copies = pipeline.build_env(config, material, worlds=settings.samples, **options)
-    actor, critic = pipeline.build_networks(config, material, env)
+    env = build_env(config, material, worlds=1, **options)
+    copies = build_env(config, material, worlds=settings.samples, **options)
+    actor, critic = build_networks(config, material, env)
     for one in (env, copies):
         prepare_for_test(one, actor, critic)
     env.reset()

@@ -16,11 +16,12 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
-from egopose import pipeline
 from egopose.benchmarks import processes
 from egopose.benchmarks.killed import LOADED, NOTES, PHASES, Notes, content, train_or_go_on, trainer_state, unequal
 from egopose.checkpoint.checkpoint import FOLDER, find_checkpoint
+from egopose.core.config import compose_config
 from egopose.core.errors import InputError
+from egopose.pipeline.dataset import motion_material
 from egopose.training.logging import CURVES
 
 #: A whole training made small: what is lost or altered by a kill does not depend on the size.
@@ -79,8 +80,8 @@ def run(overrides: Sequence[str], rounds: int) -> dict[str, Any]:
         raise InputError("bench resume", "rounds", f"must be at least 1, not {rounds}")
     # A start gets two done on average, less what its kill loses: so it does not come to its end before the last kill.
     iterations = f"algo.iterations={3 * rounds + 6}"
-    config = pipeline.compose_config("train", [*SMALL, iterations, *overrides])
-    pipeline.motion_material(config)  # prepares the data where that has not been done yet
+    config = compose_config("train", [*SMALL, iterations, *overrides])
+    motion_material(config)  # prepares the data where that has not been done yet
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload(
         ["egopose.train", "egopose.pipeline", "egopose.training.loop", "egopose.benchmarks.killed", "torch.utils.data"]

@@ -23,9 +23,12 @@ import torch
 from tensordict import MemoryMappedTensor, TensorDictBase
 from torchrl.envs import EnvBase
 
-from egopose import pipeline
 from egopose.benchmarks.process_memory import mapped_mb, private_mb, proportional_mb
 from egopose.collection.collectors import CollectorSettings, base_env, build_collector, set_threads
+from egopose.core.config import compose_config
+from egopose.pipeline.dataset import motion_material
+from egopose.pipeline.environment import build_env
+from egopose.pipeline.networks import build_networks
 from egopose.training.ppo import PPO, PPOSettings
 
 _WORLDS = (8, 32, 64)  # batch sizes between which the Python part's fixed and growing costs are told apart
@@ -61,8 +64,8 @@ def run(overrides: Sequence[str], rounds: int) -> dict[str, Any]:
         InputError: a setting is unknown or out of range.
     """
 
-    config = pipeline.compose_config("train", ["collector=multi_sync", "collector.update_threads=1", *overrides])
-    material = pipeline.motion_material(config)
+    config = compose_config("train", ["collector=multi_sync", "collector.update_threads=1", *overrides])
+    material = motion_material(config)
     settings = CollectorSettings.from_config(config["collector"])
     algo = config["algo"]
     make_env = partial(_make_env, config, material)
@@ -76,7 +79,7 @@ def run(overrides: Sequence[str], rounds: int) -> dict[str, Any]:
     }
     env = make_env(settings.worlds, 0)
     torch.manual_seed(0)
-    actor, critic = pipeline.build_networks(config, material, env)
+    actor, critic = build_networks(config, material, env)
     out["substeps"] = env.base_env.physics.substeps
     out["problem_frame_bytes"] = _own_frame_bytes(env.base_env.problem)
     out |= _collection(make_env, actor)
@@ -103,7 +106,7 @@ def _make_env(config: Mapping[str, Any], material: Any, worlds: int, number: int
 
     # Every row is read, as in hours of training.
     float(material.visual_context.sum())
-    return pipeline.build_env(config, material, worlds=worlds, threads=1, seed=number)
+    return build_env(config, material, worlds=worlds, threads=1, seed=number)
 
 
 def _own_frame_bytes(problem: Any) -> float:

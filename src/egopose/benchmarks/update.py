@@ -10,9 +10,12 @@ from typing import Any
 
 import torch
 
-from egopose import pipeline
 from egopose.collection.collectors import CollectorSettings, base_env, build_collector, set_threads
+from egopose.core.config import compose_config
 from egopose.core.runtime import settle_heap
+from egopose.pipeline.dataset import motion_material
+from egopose.pipeline.environment import build_env
+from egopose.pipeline.networks import build_networks
 from egopose.training.ppo import PPO, PPOSettings
 
 
@@ -34,13 +37,13 @@ def run(overrides: Sequence[str], rounds: int) -> dict[str, Any]:
         InputError: a setting is unknown or out of range.
     """
 
-    config = pipeline.compose_config("train", ["sim=paper", *overrides])
-    material = pipeline.motion_material(config)
+    config = compose_config("train", ["sim=paper", *overrides])
+    material = motion_material(config)
     settings = CollectorSettings.from_config(config["collector"])
     torch.manual_seed(0)
     set_threads(settings.threads)
-    env = pipeline.build_env(config, material, worlds=settings.worlds, threads=settings.physics_threads)
-    actor, critic = pipeline.build_networks(config, material, env)
+    env = build_env(config, material, worlds=settings.worlds, threads=settings.physics_threads)
+    actor, critic = build_networks(config, material, env)
     ppo = PPO(actor, critic, PPOSettings.from_config(config["algo"]))
     collector = build_collector(settings, lambda _: env, actor, int(config["algo"]["steps_per_iteration"]))
     settle_heap()

@@ -12,8 +12,6 @@ Components: ``policy critic policy_optimizer value_optimizer transforms rng simu
 
 from __future__ import annotations
 
-import hashlib
-import json
 import os
 import shutil
 import sys
@@ -26,16 +24,24 @@ import torch
 from torchrl.checkpoint import Checkpoint, CheckpointError, CheckpointRotation
 
 from egopose import __version__
+from egopose.checkpoint.checksums import _files, check_files, seal
 from egopose.checkpoint.pretrained import is_shipped, shipped_run
 from egopose.core import safe_io as untrusted
 from egopose.core.errors import InputError
 
 SCHEMA = 1
-CHECKSUMS = "checksums.json"
+
+
 FOLDER = "checkpoints"
+
+
 #: Score of a checkpoint whose weights no evaluation looked at: below any other, so that it never passes for the best.
 NOT_JUDGED = -1e300
+
+
 _PREFIX = "checkpoint-"  # of TorchRL's rotation; the control steps follow
+
+
 #: Where :func:`recover` puts a checkpoint that is not whole.
 SET_ASIDE = "damaged-"
 
@@ -203,30 +209,6 @@ def verify(path: str | Path) -> dict[str, Any]:
     return metadata
 
 
-def seal(folder: Path) -> None:
-    """Write the checksums of all files of ``folder``, for :func:`check_files`."""
-    (folder / CHECKSUMS).write_text(json.dumps(_checksums(folder), indent=1, sort_keys=True))
-
-
-def check_files(folder: Path) -> None:
-    """Compare every file of ``folder`` with the checksums written beside it.
-
-    Raises:
-        InputError: a file is missing, added or altered.
-    """
-    expected = untrusted.read_json(folder / CHECKSUMS, CHECKSUMS)
-    if not isinstance(expected, dict):
-        raise InputError(folder, CHECKSUMS, "cannot be read: is no object")
-    found = _checksums(folder)
-    for name in sorted(set(expected) | set(found)):
-        if name not in found:
-            raise InputError(folder, name, "is missing: the checkpoint is damaged")
-        if name not in expected:
-            raise InputError(folder, name, "does not belong to the checkpoint")
-        if expected[name] != found[name]:
-            raise InputError(folder, name, "does not match its checksum: the checkpoint is damaged")
-
-
 def has_component(path: str | Path, name: str) -> bool:
     """Whether a checkpoint folder holds that component. Raises InputError: see :func:`verify`."""
     verify(path)
@@ -344,18 +326,6 @@ def _first_whole(candidates: list[Path]) -> tuple[Path | None, list[InputError]]
 
 def _is_whole(folder: Path) -> bool:
     return _first_whole([folder])[0] is not None
-
-
-def _files(folder: Path) -> list[Path]:
-    return sorted(p for p in folder.rglob("*") if p.is_file() and p.name != CHECKSUMS)
-
-
-def _checksums(folder: Path) -> dict[str, str]:
-    out = {}
-    for file in _files(folder):
-        with file.open("rb") as stream:
-            out[file.relative_to(folder).as_posix()] = hashlib.file_digest(stream, "sha256").hexdigest()
-    return out
 
 
 def _flush(path: Path) -> None:

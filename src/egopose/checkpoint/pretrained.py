@@ -8,7 +8,7 @@ from __future__ import annotations
 import difflib
 from pathlib import Path
 
-from egopose.checkpoint.checkpoint import check_files
+from egopose.checkpoint.checksums import check_files
 from egopose.core.errors import InputError
 
 PREFIX = "weights:"

@@ -18,7 +18,7 @@ from egopose.collection.stepping import TransformedEgoPoseEnv
 from egopose.collection.workers import Workers, base_env, read_simulation, write_simulation
 from egopose.core.config import from_mapping
 from egopose.core.errors import InputError
-from egopose.core.runtime import prefer_quick_products
+from egopose.core.torch_settings import prefer_quick_products
 
 __all__ = [
     "CollectorSettings",

@@ -23,7 +23,8 @@ from torchrl.envs import EnvBase, TransformedEnv
 from egopose.collection.moments import merge_states, without_counts
 from egopose.collection.stepping import key_path
 from egopose.core.errors import InputError
-from egopose.core.runtime import end_with_parent, prefer_quick_products
+from egopose.core.runtime import end_with_parent
+from egopose.core.torch_settings import prefer_quick_products
 
 State = dict[str, Any]
 

@@ -8,13 +8,8 @@ from __future__ import annotations
 
 import importlib
 import sys
-from collections.abc import Iterator
-from pathlib import Path
-from typing import Any
 
-import yaml
-
-from egopose.core.config import config_dir
+from egopose.core.config_files import _groups, _settings, config_dir
 from egopose.core.verbs import BENCHMARKS, VERBS
 
 _BASH = """\
@@ -32,6 +27,7 @@ _egopose() {
 complete -o default -F _egopose egopose
 """
 
+
 _ZSH = """\
 # egopose: eval "$(egopose completion zsh)"
 _egopose() {
@@ -42,10 +38,16 @@ _egopose() {
 compdef _egopose egopose
 """
 
+
 SCRIPTS = {"bash": _BASH, "zsh": _ZSH}
 
+
 _PARSED = ("bench", "view")  # verbs with options in the manner of --port
+
+
 _CONFIG = {"bench": "train", "demo": "train"}  # verbs whose settings stand in another's file
+
+
 _MORE = {"demo": ("budget=",), "export": ("to=",)}  # words that stand in no file
 
 
@@ -64,9 +66,8 @@ def candidates(line: str, verbs: list[str]) -> list[str]:
         return [shell for shell in SCRIPTS if shell.startswith(word)]
     if verb in _PARSED and word.startswith("-"):
         return [option for option in _options(verb) if option.startswith(word)]
-    if verb == "bench":
-        if not set(words[2:-1]) & set(BENCHMARKS):
-            return [name for name in BENCHMARKS if name.startswith(word)]
+    if verb == "bench" and not set(words[2:-1]) & set(BENCHMARKS):
+        return [name for name in BENCHMARKS if name.startswith(word)]
     more = [key for key in _MORE.get(verb, ()) if key.startswith(word)]
     folder, verb = config_dir(), _CONFIG.get(verb, verb)
     if not (folder / f"{verb}.yaml").is_file():
@@ -82,62 +83,10 @@ def candidates(line: str, verbs: list[str]) -> list[str]:
     return sorted({m[: m.find(".", len(word)) + 1] or m for m in matching})
 
 
-def setting_names(verb: str) -> list[str]:
-    """All settings and groups of ``conf/VERB.yaml``, as they are given on the command line."""
-    folder = config_dir()
-    groups = _groups(folder, verb)
-    return sorted({*groups, *(key.rstrip("=") for key in _settings(folder, verb, groups))})
-
-
 def _options(verb: str) -> list[str]:
     """Of a verb that reads its command with argparse."""
     parser = importlib.import_module(f"egopose.{verb}").command_line()
     return [option for action in parser._actions for option in action.option_strings if option.startswith("--")]
-
-
-def _load(path: Path) -> dict[str, Any]:
-    """One of the package's own files, interpolations as they stand."""
-    values = yaml.safe_load(path.read_text())
-    return {str(key): value for key, value in values.items()} if isinstance(values, dict) else {}
-
-
-def _groups(folder: Path, verb: str) -> dict[str, str | None]:
-    """Groups of a verb's configuration and the choice each has by default."""
-    entries = [entry for entry in _load(folder / f"{verb}.yaml").get("defaults", []) if isinstance(entry, dict)]
-    return {g: choice for entry in entries for g, choice in entry.items() if not g.startswith("override ")}
-
-
-def _settings(folder: Path, verb: str, groups: dict[str, str | None]) -> Iterator[str]:
-    """Every ``key=`` of the verb's own file and of its groups' choices."""
-    yield from _keys(_load(folder / f"{verb}.yaml"), "")
-    for group, choice in groups.items():
-        yield from _choice(folder, group, f"{choice}", f"{group}.")
-
-
-def _choice(folder: Path, group: str, choice: str, prefix: str) -> Iterator[str]:
-    """Of one file of a group, and of those it builds on."""
-    path = folder / group / f"{choice}.yaml"
-    if not path.is_file():
-        return
-    values = _load(path)
-    yield from _keys(values, prefix)
-    for base in values.get("defaults", []):
-        if isinstance(base, dict):  # {/group@package: choice}
-            for name, chosen in base.items():
-                other, _, package = name.lstrip("/").partition("@")
-                yield from _choice(folder, other, str(chosen), f"{prefix}{package}.")
-        elif base != "_self_":
-            yield from _choice(folder, group, str(base), prefix)
-
-
-def _keys(values: dict[str, Any], prefix: str) -> Iterator[str]:
-    for key, value in values.items():
-        if key in ("defaults", "hydra"):
-            continue
-        if isinstance(value, dict) and value:
-            yield from _keys(value, f"{prefix}{key}.")
-        else:
-            yield f"{prefix}{key}="
 
 
 def main() -> None:

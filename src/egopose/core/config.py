@@ -24,24 +24,11 @@ from hydra.errors import HydraException, OverrideParseException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
-from egopose.core.completion import setting_names
+from egopose.core.config_files import config_dir, setting_names
 from egopose.core.errors import InputError
 from egopose.core.safe_io import check_config_folder
 
 T = TypeVar("T")
-
-
-def config_dir() -> Path:
-    """The folder of Hydra groups: inside the installed package, or ``conf/`` of the checkout it was installed from.
-
-    Raises:
-        InputError: neither is there.
-    """
-    package = Path(__file__).resolve().parents[1]
-    for place in (package / "conf", package.parents[1] / "conf"):
-        if (place / "train.yaml").is_file():
-            return place
-    raise InputError(package / "conf", "train.yaml", "the configuration is missing: the installation is incomplete")
 
 
 def resolved(config: DictConfig) -> dict[str, Any]:

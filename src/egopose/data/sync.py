@@ -20,6 +20,7 @@ from egopose.core.config import from_mapping
 from egopose.core.errors import InputError
 from egopose.data.prepare_motion import without_lead_in
 from egopose.motion import rotations as rot
+from egopose.motion.io import read_motion
 from egopose.motion.mapping import identify
 from egopose.motion.motion import Motion
 from egopose.motion.rotations import Array
@@ -225,3 +226,16 @@ def settings_of(data: Mapping[str, Any]) -> SyncSettings:
     if not data.get("sync"):
         raise InputError("data", "sync", "is missing: offsets can be found with data=own, which has these settings")
     return from_mapping(SyncSettings, data["sync"], "data.sync")
+
+
+def run_sync(config: Mapping[str, Any]) -> Sync:
+    """The way of ``conf/sync.yaml``, resolved.
+
+    Raises:
+        InputError: video, motion or a setting cannot be used, or no offset stands out; says what to do then.
+    """
+    camera = Camera.from_mapping(config["data"]["camera"], "data.camera")
+    motion = read_motion(str(config["motion"]), **config["reader"])
+    flow = FlowConfig(**config["vision"]["flow"])
+    settings = settings_of(config["data"])
+    return sync_offset(str(config["video"]), motion, settings, flow, camera, dict(config["mapping"]))

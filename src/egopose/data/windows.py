@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from egopose.envs.starts import FragmentLike
+from egopose.data.fragments import FragmentLike
 
 
 class ForecastWindow(NamedTuple):

@@ -9,12 +9,13 @@ from typing import Any
 from tensordict import TensorDictBase
 from torch import Tensor
 
+from egopose.data.fragments import FragmentLike
 from egopose.envs.aids import Aids
 from egopose.envs.env import EgoPoseEnv
 from egopose.envs.mdp.rewards import build_reward
 from egopose.envs.problem import ActionSettings, ImitationProblem, TakeTable, TerminationSettings
 from egopose.envs.reference_forecasts import Futures
-from egopose.envs.starts import AdaptiveStarts, FragmentLike, Starts, UniformStarts, WholeFragments, after_context
+from egopose.envs.starts import AdaptiveStarts, Starts, UniformStarts, WholeFragments, after_context
 from egopose.humanoid.model import HumanoidModel
 
 

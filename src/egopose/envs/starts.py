@@ -9,18 +9,8 @@ from typing import NamedTuple, Protocol
 import torch
 from torch import Tensor
 
+from egopose.data.fragments import FragmentLike
 from egopose.envs.aids import AdaptiveStartSettings
-
-
-class FragmentLike(Protocol):
-    """Frames ``start`` to ``stop`` (exclusive) of take number ``take``, counted within the take."""
-
-    @property
-    def take(self) -> int: ...
-    @property
-    def start(self) -> int: ...
-    @property
-    def stop(self) -> int: ...
 
 
 class Piece(NamedTuple):

@@ -10,12 +10,13 @@ import torch
 from torchrl.envs import TransformedEnv
 
 from egopose.core.errors import InputError
-from egopose.core.runtime import torch_threads
-from egopose.envs.starts import FragmentLike
+from egopose.core.torch_settings import torch_threads
+from egopose.data.fragments import FragmentLike
+from egopose.envs.test_time import Controller
 from egopose.evaluation.protocols import ContactSettings, TakeScores, score_take
 from egopose.evaluation.resets import TakeTriggers, as_dict, take_triggers
 from egopose.inference.counterfactuals import Forks
-from egopose.inference.estimator import Controller, Estimate, estimate_takes
+from egopose.inference.estimator import Estimate, estimate_takes
 from egopose.inference.failsafe import FailSafe, FailSafeSettings
 from egopose.inference.planner import Planner
 from egopose.inference.planner_settings import PlannerSettings, planned_kappa

@@ -1,9 +1,4 @@
-"""``python -m egopose.demo [budget=short] [key=value ...]``: from the embedded clips to a trained, evaluated policy.
-
-Prepares the default data (renders the wearer's video), trains the state regressor and a policy, evaluates them beside
-PoseReg on held-out frames and writes tables, motions and side-by-side videos. Then the weights that ship with the
-package see the same held-out frames. Further words are overrides of ``conf/train.yaml``.
-"""
+"""The demonstration: from the embedded clips to a trained, evaluated policy, one stage after the other."""
 
 from __future__ import annotations
 
@@ -19,7 +14,6 @@ from egopose.checkpoint.pretrained import PREFIX, shipped_names
 from egopose.core.config import compose_config
 from egopose.core.errors import InputError
 from egopose.data.preparation import flow_name, store_folder
-from egopose.demo import _BUDGETS
 from egopose.evaluation.agents import survival_figures
 from egopose.evaluation.estimation_run import run_evaluation, summary
 from egopose.evaluation.forecast_run import run_forecast_evaluation
@@ -29,6 +23,7 @@ from egopose.pipeline.dataset import absolute_paths, load_material
 from egopose.pipeline.networks import build_networks
 from egopose.pipeline.training import run_training
 
+_BUDGETS = {"full": "demo", "short": "demo_short"}
 _SHORTEST_TRAINING = 45.0  # s, on a machine so slow that the budget is used up before
 
 

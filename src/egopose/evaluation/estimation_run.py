@@ -17,8 +17,9 @@ from egopose.evaluation import report, tables
 from egopose.evaluation import resets as triggers
 from egopose.evaluation.agents import evaluate_agent, failsafe_figures, survival_figures
 from egopose.evaluation.protocols import Comparison, ContactSettings, fragment_names
-from egopose.evaluation.report import HEADLINE, TakeVideo
+from egopose.evaluation.report import HEADLINE
 from egopose.inference.failsafe import FailSafeSettings
+from egopose.inference.outputs import TakeVideo, write_footage, write_side_by_side
 from egopose.inference.planner_settings import planned_kappa, planner_settings
 from egopose.pipeline.agent import Agent
 from egopose.pipeline.networks import build_networks
@@ -113,12 +114,12 @@ def run_evaluation(
         folder = report.write_take(out / "takes", result)
         video = videos[fragment.take]
         if video is not None:
-            report.write_footage(folder, video, fragment.start, result.motion.fps)
+            write_footage(folder, video, fragment.start, result.motion.fps)
         if video is None or (shown is not None and number >= shown):
             continue
         path = folder / "side_by_side.mp4"
         motions = {"reference": result.reference, "estimate": result.motion}
-        report.write_side_by_side(path, material.humanoid, motions, video, fragment.start, int(config["video"]["size"]))
+        write_side_by_side(path, material.humanoid, motions, video, fragment.start, int(config["video"]["size"]))
         written.append(path)
     return Results(out, comparison, survival, guarded, written, report.rendered_notes(about))
 

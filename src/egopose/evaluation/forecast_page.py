@@ -21,8 +21,8 @@ from egopose.evaluation.charts import Line
 from egopose.evaluation.estimation_page import ReportSettings, root_aligned_errors
 from egopose.evaluation.forecast_metrics import METRICS
 from egopose.evaluation.forecast_report import FUTURE_COLOUR, TRUTH_COLOUR, other_file
-from egopose.evaluation.report import RENDERED_NOTE
 from egopose.humanoid.model import HumanoidModel
+from egopose.inference.outputs import RENDERED_NOTE
 from egopose.motion.io import read_motion
 from egopose.motion.motion import Motion
 from egopose.motion.rotations import Array

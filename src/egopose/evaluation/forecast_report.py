@@ -10,16 +10,16 @@ from typing import Any
 
 import numpy as np
 
+from egopose.core.result_files import write_json
 from egopose.data.windows import ForecastWindow
-from egopose.evaluation import tables
-from egopose.evaluation.compose import middle_square
 from egopose.evaluation.forecast_metrics import METRICS, ForecastScores
-from egopose.evaluation.report import TakeVideo, file_name
 from egopose.evaluation.statistics import Interval, mean_interval, ratio_interval
 from egopose.humanoid.model import HumanoidModel
+from egopose.inference.outputs import TakeVideo, file_name
 from egopose.motion.rotations import Array
 from egopose.vision.overlay import ghost_frames
 from egopose.vision.rendering import label_frame
+from egopose.vision.side_by_side import middle_square
 from egopose.vision.video import Frame, iter_frames, write_video
 
 _UNITS = {"E_pose": "rad", "E_vel": "", "A_accl": ""}
@@ -126,7 +126,7 @@ def write_forecast_results(
         "figures": plain(comparison.figures),
         "ratios": plain(comparison.ratios),
     }
-    tables.write_json(folder / "results.json", values)
+    write_json(folder / "results.json", values)
     (folder / "results.md").write_text(as_markdown(comparison) + "\n" + "\n".join(notes) + "\n")
     with (folder / "windows.csv").open("w", newline="") as stream:
         writer = csv.writer(stream)

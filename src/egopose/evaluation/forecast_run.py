@@ -15,18 +15,19 @@ from torch import Tensor
 
 from egopose.core.config import from_mapping
 from egopose.core.errors import InputError
-from egopose.core.runtime import torch_threads
+from egopose.core.result_files import write_columns_csv
+from egopose.core.torch_settings import torch_threads
+from egopose.data.fragments import FragmentLike
 from egopose.data.windows import ForecastWindow, forecast_windows
-from egopose.envs.starts import FragmentLike
 from egopose.evaluation import forecast_report as report
-from egopose.evaluation import tables
 from egopose.evaluation.forecast_metrics import score_forecasts, true_futures
 from egopose.evaluation.forecast_report import other_file
-from egopose.evaluation.report import RENDERED_NOTE, TakeVideo, file_name, write_footage, write_motion_files
 from egopose.inference.bands import Bands, fit_scale, quantile_bands
 from egopose.inference.failsafe import FailSafeSettings
 from egopose.inference.forecast_contexts import SOURCES, past_states
+from egopose.inference.forecast_start import begin_forecasts
 from egopose.inference.forecaster import Forecasts, forecast
+from egopose.inference.outputs import RENDERED_NOTE, TakeVideo, file_name, write_footage, write_motion_files
 from egopose.inference.planner import Planner, followed_futures
 from egopose.inference.planner_settings import PlannerSettings, planner_settings
 from egopose.models.baselines.recurrent import RecurrentForecaster
@@ -35,7 +36,6 @@ from egopose.motion.motion import Motion
 from egopose.motion.rotations import Array
 from egopose.pipeline.agent import Agent
 from egopose.pipeline.baselines import forecast_qpos, load_baseline
-from egopose.pipeline.forecaster import begin_forecasts
 from egopose.tasks.dataset import Material
 
 OURS, DRAWN, STILL = "ours", "ours, drawn", "standing still"
@@ -319,7 +319,7 @@ def _write_windows(
         if bands is not None:
             edges = {"low": bands.low[w], "median": bands.median[w], "high": bands.high[w]}
             columns = {f"{dof_names[d]}_{edge}": v[:, i] for i, d in enumerate(used) for edge, v in edges.items()}
-            tables.write_columns_csv(folder / "bands.csv", columns)
+            write_columns_csv(folder / "bands.csv", columns)
         if shown is not None and w >= shown:
             continue
         around = np.zeros((0, *truth[w].shape)) if drawn is None else drawn.qpos[w, :3]

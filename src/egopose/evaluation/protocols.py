@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from egopose.envs.starts import FragmentLike
+from egopose.data.fragments import FragmentLike
 from egopose.evaluation import metrics, position_metrics
 from egopose.evaluation.keypoints import motion_keypoints, side_view_error
 from egopose.evaluation.statistics import Interval, mean_interval, ratio_interval

@@ -1,28 +1,25 @@
-"""``python -m egopose.kappa checkpoint=RUN [kappas=[..]]``: choose the fail-safe's kappa on training takes."""
+"""Choosing the fail-safe's threshold for a run, on its training takes."""
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from omegaconf import DictConfig
 
-from egopose.core.config import command, resolved
 from egopose.core.errors import InputError
+from egopose.core.result_files import write_json
 from egopose.evaluation import metrics
 from egopose.evaluation import resets as triggers
 from egopose.evaluation.agents import estimate_and_judge
 from egopose.evaluation.options import output_folder, physics_group
-from egopose.evaluation.tables import write_json
 from egopose.inference.failsafe import FailSafeSettings, paper_kappa
 from egopose.inference.video_regression import require_estimation
 from egopose.pipeline.agent import Agent, load_agent
 
-_SOURCE = "conf/kappa.yaml"
+_SOURCE = "conf/evaluate.yaml"
 
 
 def try_kappas(agent: Agent, kappas: Sequence[float], window: int, threads: int) -> list[dict[str, Any]]:
@@ -62,7 +59,9 @@ def chosen(rows: Sequence[Mapping[str, Any]]) -> float:
     """
     told = [row for row in rows if row["f1"] is not None]
     if not told:
-        raise InputError(_SOURCE, "kappas", "no fall and no trigger on the training takes: nothing to choose by")
+        raise InputError(
+            _SOURCE, "reset_threshold.tried", "no fall and no trigger on the training takes: nothing to choose by"
+        )
     best = max(row["f1"] for row in told)
     return float(min(row["kappa"] for row in told if row["f1"] == best))
 
@@ -80,29 +79,27 @@ def as_text(rows: Sequence[Mapping[str, Any]]) -> str:
     return "\n".join(lines)
 
 
-@command("kappa")
-def main(config: DictConfig) -> None:
-    """Hydra's entry."""
+def choose_threshold(values: Mapping[str, Any]) -> str:
+    """Try the thresholds of ``conf/evaluate.yaml`` on a run's training takes; what the terminal shows.
 
-    try:
-        values = resolved(config)
-        kappas = values["kappas"]
-        if not isinstance(kappas, list) or not kappas or not all(isinstance(k, int | float) for k in kappas):
-            raise InputError(_SOURCE, "kappas", f"must be a list of numbers, not {kappas!r}")
-        agent = load_agent(str(values["checkpoint"]), None, str(values["which"]), physics_group(values["physics"]))
-        require_estimation(agent.config, agent.path)
-        usual = round(paper_kappa(float(agent.config["algo"]["gamma"])), 3)
-        rows = try_kappas(agent, sorted({*kappas, usual}), int(values["window"]), int(values["threads"]))
-        given = values["out"]
-        out = output_folder(None, agent.path, "train").parent / "kappa.json" if given is None else Path(str(given))
-        out.parent.mkdir(parents=True, exist_ok=True)
-        kappa = chosen(rows)
-        write_json(out, {"checkpoint": str(agent.path), "chosen": kappa, "default": usual, "rows": rows})
-        print(f"{as_text(rows)}\nevaluate takes {usual:g} unless told otherwise; best here: failsafe.kappa={kappa:g}")
-    except InputError as error:
-        print(f"error: {error}", file=sys.stderr)
-        raise SystemExit(2) from None
+    Args:
+        values: ``conf/evaluate.yaml``, resolved; its group ``reset_threshold`` says which to try.
 
-
-if __name__ == "__main__":
-    main()
+    Raises:
+        InputError: a setting is wrong, or nothing ever fell.
+    """
+    settings = values["reset_threshold"]
+    kappas, given = settings["tried"], values["out"]
+    if not isinstance(kappas, list) or not kappas or not all(isinstance(k, int | float) for k in kappas):
+        raise InputError(_SOURCE, "reset_threshold.tried", f"must be a list of numbers, not {kappas!r}")
+    agent = load_agent(str(values["checkpoint"]), None, str(values["which"]), physics_group(values["physics"]))
+    require_estimation(agent.config, agent.path)
+    usual = round(paper_kappa(float(agent.config["algo"]["gamma"])), 3)
+    window = int(values["failsafe_report"]["window"])
+    rows = try_kappas(agent, sorted({*kappas, usual}), window, int(values["threads"]))
+    folder = output_folder(None, agent.path, "train").parent if given is None else Path(str(given))
+    folder.mkdir(parents=True, exist_ok=True)
+    kappa = chosen(rows)
+    found = {"checkpoint": str(agent.path), "chosen": kappa, "default": usual, "rows": rows}
+    write_json(folder / "reset_threshold.json", found)
+    return f"{as_text(rows)}\nevaluate takes {usual:g} unless told otherwise; best here: failsafe.kappa={kappa:g}"

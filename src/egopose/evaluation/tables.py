@@ -3,18 +3,14 @@
 from __future__ import annotations
 
 import csv
-import json
-import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
+from egopose.core.result_files import csv_cell
 from egopose.evaluation.protocols import METRICS, Comparison
 from egopose.evaluation.statistics import Interval
-from egopose.motion.rotations import Array
 
 
 def rows(comparison: Comparison, keys: Sequence[str] | None = None) -> tuple[list[str], list[list[str]]]:
@@ -72,24 +68,6 @@ def as_dict(comparison: Comparison) -> dict[str, Any]:
     }
 
 
-def write_json(path: Path, values: Mapping[str, Any]) -> None:
-    """Strict JSON: what is not finite becomes null."""
-    path.write_text(json.dumps(_finite(values), indent=1, allow_nan=False) + "\n")
-
-
-def write_columns_csv(path: Path, columns: Mapping[str, Array]) -> None:
-    """One row a frame of one take; ``columns`` hold at most one value a frame and end with the take.
-
-    Metrics of velocities and accelerations are differences to the frames before: their first rows are empty.
-    """
-    length = max(len(v) for v in columns.values())
-    padded = {k: [""] * (length - len(v)) + [_cell(x) for x in v] for k, v in columns.items()}
-    with path.open("w", newline="") as stream:
-        writer = csv.writer(stream)
-        writer.writerow(["frame", *padded])
-        writer.writerows([t, *(padded[k][t] for k in padded)] for t in range(length))
-
-
 def write_csv(path: Path, comparison: Comparison) -> None:
     """One row per method, run and take; a column per metric."""
     with path.open("w", newline="") as stream:
@@ -98,24 +76,10 @@ def write_csv(path: Path, comparison: Comparison) -> None:
         for method, table in comparison.per_take.items():
             for run in range(len(next(iter(table.values())))):
                 for k, take in enumerate(comparison.takes):
-                    writer.writerow([method, run, take, *(_cell(table[m.key][run][k]) for m in METRICS)])
+                    writer.writerow([method, run, take, *(csv_cell(table[m.key][run][k]) for m in METRICS)])
 
 
 def _interval(interval: Interval | None, decimals: int) -> str:
     if interval is None:
         return "-"
     return f"{interval.value:.{decimals}f} [{interval.low:.{decimals}f}, {interval.high:.{decimals}f}]"
-
-
-def _cell(value: float) -> str:
-    return f"{float(value):.8g}" if np.isfinite(value) else ""
-
-
-def _finite(value: Any) -> Any:
-    if isinstance(value, Mapping):
-        return {str(k): _finite(v) for k, v in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_finite(v) for v in value]
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value

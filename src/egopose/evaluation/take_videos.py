@@ -10,7 +10,7 @@ from typing import Any
 
 from egopose.data.preparation import store_folder, video_of
 from egopose.data.store import TakeStore
-from egopose.evaluation.report import TakeVideo
+from egopose.inference.outputs import TakeVideo
 
 
 def take_videos(config: Mapping[str, Any]) -> tuple[list[str], list[TakeVideo | None]]:

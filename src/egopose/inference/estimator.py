@@ -8,32 +8,26 @@ mean action is where planning begins, and V(s_t) is what the best plan is worth.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from tensordict import TensorDictBase
-from torch import Tensor, nn
+from torch import Tensor
 from torchrl.envs import TransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from egopose.envs.env import EgoPoseEnv
-from egopose.envs.transforms import StateNormalizer
+from egopose.envs.test_time import Controller, prepare_for_test
 from egopose.humanoid.foot_geometry import out_of_floor
 from egopose.humanoid.model import HumanoidModel
 from egopose.inference.counterfactuals import Forks
 from egopose.inference.failsafe import FailSafe
 from egopose.inference.planner import Planner
-from egopose.models.episode_context import EpisodeContext
 from egopose.models.pose_regression import state_to_qpos
 from egopose.motion import rotations as rot
 from egopose.motion.motion import Motion
 from egopose.motion.rotations import Array
-
-#: What writes ``action`` (an actor: its mean action is taken) or ``state_value`` into an observation.
-Controller = Callable[[TensorDictBase], TensorDictBase]
 
 
 @dataclass(frozen=True)
@@ -172,21 +166,6 @@ def estimate_takes(
         )
         for i, n in enumerate(lengths.tolist())
     ]
-
-
-def prepare_for_test(env: TransformedEnv, *controllers: Controller, lookahead: int | None = None) -> None:
-    """Freeze the state normaliser and let trainable contexts see a take in one pass: each frame's to the take's end, or
-    ``lookahead`` frames ahead and no more."""
-    for module in env.transform.modules():
-        if isinstance(module, StateNormalizer):
-            module.freeze()
-    for network in controllers:
-        if not isinstance(network, nn.Module):
-            continue
-        network.eval()
-        for module in network.modules():
-            if isinstance(module, EpisodeContext):
-                module.horizon, module.lookahead = None, lookahead
 
 
 def _restart(base: EgoPoseEnv, worlds: Tensor, states: Tensor, qpos: Tensor) -> None:

@@ -17,12 +17,8 @@ from torchrl.envs import TransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from egopose.envs.env import EgoPoseEnv
-from egopose.humanoid.foot_geometry import out_of_floor
-from egopose.humanoid.model import HumanoidModel
-from egopose.inference.estimator import Controller, prepare_for_test
+from egopose.envs.test_time import Controller, prepare_for_test
 from egopose.inference.planner import Planner
-from egopose.models.pose_regression import state_to_qpos
-from egopose.motion import rotations as rot
 from egopose.motion.rotations import Array
 
 
@@ -109,10 +105,3 @@ def forecast(
         torch.stack(falls, dim=1).numpy().reshape(shape),
         broken.numpy().reshape(shape[:2]),
     )
-
-
-def placed_states(states: Array, reference: Array, humanoid: HumanoidModel) -> tuple[Tensor, Tensor]:
-    """States z ``[W, S]`` as qpos ``[W, nq]`` and qvel ``[W, nv]``, standing and facing as ``reference [W, nq]``, feet
-    out of the floor."""
-    qpos, qvel = state_to_qpos(states, reference[:, :2], rot.heading(reference[:, 3:7]), humanoid.joint_range)
-    return torch.from_numpy(out_of_floor(humanoid, qpos)), torch.from_numpy(qvel)

@@ -11,11 +11,11 @@ import torch
 from egopose.checkpoint.checkpoint import find_checkpoint, read_json
 from egopose.core.config import from_mapping
 from egopose.core.errors import InputError
+from egopose.core.result_files import write_columns_csv
 from egopose.data.preparation import humanoid_of
-from egopose.evaluation.report import TakeVideo, write_footage, write_motion_files, write_side_by_side
-from egopose.evaluation.tables import write_columns_csv
 from egopose.inference.estimator import estimate_takes
 from egopose.inference.failsafe import FailSafe, FailSafeSettings
+from egopose.inference.outputs import TakeVideo, write_footage, write_motion_files, write_side_by_side
 from egopose.inference.planner import Planner
 from egopose.inference.planner_settings import PlannerSettings, planned_kappa, planner_settings
 from egopose.inference.video_regression import (

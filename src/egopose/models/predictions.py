@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from egopose.core.runtime import torch_threads
+from egopose.core.torch_settings import torch_threads
 from egopose.data.spans import Span
 from egopose.models.regressor import StateRegressor
 from egopose.models.regressor_settings import RegressorSettings

@@ -15,17 +15,16 @@ import torch
 from torch import Tensor, nn
 
 from egopose.checkpoint import checkpoint as checkpoints
-from egopose.checkpoint.resume import mark_finished
+from egopose.checkpoint.resume import continued_job, finished, mark_finished
 from egopose.core.atomic_write import write_text_whole
 from egopose.core.errors import InputError
+from egopose.data.fragments import FragmentLike
 from egopose.data.preparation import flow_name, global_spans, store_folder
 from egopose.data.spans import Span
 from egopose.data.splits import split_takes
 from egopose.data.store import TakeStore
 from egopose.data.windows import ForecastWindow
 from egopose.envs.mdp.observations import humanoid_state
-from egopose.envs.starts import FragmentLike
-from egopose.evaluation.protocols import ContactSettings, TakeScores, score_take
 from egopose.models.baselines.path_pose import PathPose
 from egopose.models.baselines.recurrent import RecurrentForecaster, pose_state_size
 from egopose.models.mirror import state_mirror
@@ -36,11 +35,14 @@ from egopose.motion.rotations import Array
 from egopose.pipeline.dataset import load_material, run_material
 from egopose.tasks.dataset import Material
 from egopose.training.fitting import Fit, FitResult, FitSettings, State, fit
+from egopose.training.logging import write_provenance
 from egopose.training.loop import stop_signals
 from egopose.training.path_pose import PathPoseLearner, PathPoseSettings, build_path_pose
 from egopose.training.recurrent_baselines import RecurrentLearner, RecurrentSettings, build_forecaster
 
 KINDS = ("recurrent", "path_pose")
+
+
 RESULT = "baseline.json"
 
 
@@ -92,6 +94,28 @@ def run_baseline(
     write_text_whole(folder / RESULT, json.dumps({"reason": result.reason, "curve": curve}, indent=1))
     mark_finished(folder, config, {"reason": result.reason, "iteration": result.steps, "score": _score(result)})
     return result
+
+
+def run_baseline_job(config: dict[str, Any], folder: Path) -> None:
+    """Train in ``folder`` as far as that is still to be done: from its last checkpoint, or not at all.
+
+    Raises:
+        InputError: as :func:`run_baseline`; the directory is that of another job.
+    """
+    checkpoint = continued_job(folder, config)
+    if (done := finished(folder, config)) is not None:
+        print(f"{folder}: {done['reason']} already after {done['iteration']} steps", flush=True)
+        return
+    write_provenance(folder, config)
+    print(f"run directory: {folder}", flush=True)
+    result = run_baseline(config, folder, checkpoint)
+    print(
+        f"{result.reason}: {result.steps} steps, {result.frames} frames, held-out error {result.held_out:.4f}",
+        flush=True,
+    )
+    if result.reason == "interrupted":
+        print(f"go on with: python -m egopose.baseline resume={folder}", flush=True)
+        raise SystemExit(130)
 
 
 def _number(value: float) -> float | None:
@@ -216,17 +240,6 @@ def regressed_motion(material: Material, fragment: FragmentLike, name: str = "")
     rows = _rows(material, fragment)
     assert material.states is not None
     return _placed(material.states[rows].numpy(), material, rows, name)
-
-
-def score_motions(
-    motions: Sequence[Motion], fragments: Sequence[FragmentLike], material: Material, contact: ContactSettings
-) -> list[TakeScores]:
-    """Figures of a kinematic method's motions, one a fragment, against the reference."""
-    truth: Array = torch.as_tensor(material.reference["qpos"]).double().numpy()
-    return [
-        score_take(motion.name, motion.qpos, truth[_rows(material, fragment)], material.humanoid, contact)
-        for motion, fragment in zip(motions, fragments, strict=True)
-    ]
 
 
 def _rows(material: Material, fragment: FragmentLike) -> slice:

@@ -1,4 +1,4 @@
-"""``python -m egopose.limbs motions='[PATH/*.txt]' out=FOLDER``: draw pictures of bodies and train a limb finder."""
+"""From motions to a trained body-part estimator: pictures of bodies are drawn, and the network learns from them."""
 
 from __future__ import annotations
 
@@ -12,10 +12,9 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from omegaconf import DictConfig
 
 from egopose.checkpoint.checkpoint import read_json
-from egopose.core.config import command, convert, resolved
+from egopose.core.config import convert
 from egopose.core.errors import InputError
 from egopose.data.preparation import humanoid_of
 from egopose.data.prepare_motion import PreparationSettings, reference_motion
@@ -75,7 +74,7 @@ def base_clips(
 
 
 def make_finder(values: Mapping[str, Any]) -> dict[str, Any]:
-    """The way of ``conf/limbs.yaml``, resolved; returns the finder's card. What is there already is not made again.
+    """The way of ``conf/body_parts.yaml``, resolved; returns the finder's card. What is there already is not made again.
 
     Raises:
         InputError: a motion or a setting cannot be used, or ``out`` holds what others made.
@@ -129,16 +128,14 @@ def make_finder(values: Mapping[str, Any]) -> dict[str, Any]:
     return card
 
 
-@command("limbs")
-def main(config: DictConfig) -> None:
-    """Hydra's entry."""
-    values = resolved(config)
+def train_body_parts(values: Mapping[str, Any]) -> None:
+    """:func:`make_finder`, and what it found on the terminal.
+
+    Raises:
+        InputError: see there.
+    """
     card = make_finder(values)
     print(f"{card['held_out']} held-out pictures; share of the variance that is explained:")
     for group, figures in card["figures"].items():
         print(f"{group}: " + ", ".join(f"{name} {value:.2f}" for name, value in figures.items()))
     print(f"finder: {Path(str(values['out'])) / 'finder'}")
-
-
-if __name__ == "__main__":
-    main()

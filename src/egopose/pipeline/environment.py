@@ -14,12 +14,12 @@ from torchrl.envs import TransformedEnv
 
 from egopose.collection.stepping import TransformedEgoPoseEnv
 from egopose.core.errors import InputError
+from egopose.data.fragments import FragmentLike
 from egopose.envs import build as envs
 from egopose.envs.aids import Aids
 from egopose.envs.forecasting_transforms import RecurrentStates, TimeLeft
 from egopose.envs.mdp.observations import humanoid_state
 from egopose.envs.reference_forecasts import FollowFuture
-from egopose.envs.starts import FragmentLike
 from egopose.envs.transforms import RawState, StateNormalizer, TrackingError, VisualContext
 from egopose.models.recurrent import hidden_keys
 from egopose.tasks.dataset import Material, smoothed

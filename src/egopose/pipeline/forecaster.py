@@ -18,19 +18,16 @@ import torch
 from torch import Tensor, nn
 
 from egopose.checkpoint.checkpoint import ComponentState, RunCheckpoint, has_component, metadata_of
+from egopose.checkpoint.run_folder import FOLDER
 from egopose.core.errors import InputError
 from egopose.data.preparation import flow_name, global_spans, store_folder
 from egopose.data.spans import Span, cross_fit_blocks, group_blocks
 from egopose.data.splits import split_takes
 from egopose.data.store import TakeStore
-from egopose.data.windows import ForecastWindow
 from egopose.envs.mdp.observations import humanoid_state
 from egopose.envs.reference_forecasts import Futures
-from egopose.humanoid.foot_geometry import out_of_floor
-from egopose.inference.forecaster import placed_states
 from egopose.models.mirror import state_mirror
 from egopose.models.motion_forecast import ContinuedForecaster, KernelForecaster, MotionForecaster, spline_basis
-from egopose.pipeline.agent import Agent
 from egopose.pipeline.regressor import training_contexts
 from egopose.tasks.dataset import Material
 from egopose.training.continued_forecast import (
@@ -39,12 +36,9 @@ from egopose.training.continued_forecast import (
     fit_continued_forecaster,
 )
 from egopose.training.fitting import FitSettings, fit
+from egopose.training.forecaster_settings import ForecasterSettings
 from egopose.training.kernel_forecast import Contexts, blank_kernel_forecaster, fit_kernel_forecaster
-from egopose.training.motion_forecast import ForecasterSettings, ForecastLearner, build_forecaster, cross_fit_starts
-
-FOLDER = "forecaster"
-#: Components of that folder that forecasts are made by; ``futures`` are those of the training frames.
-PARTS = ("members", "kernel", "sizes", "continued")
+from egopose.training.motion_forecast import ForecastLearner, build_forecaster, cross_fit_starts
 
 
 @dataclass(frozen=True)
@@ -86,25 +80,6 @@ def with_futures(config: Mapping[str, Any], material: Material, run: Path) -> Ma
         knots, size = spline_basis(settings.horizon + 1, settings.spacing, _fps(material))[0].shape[1], _size(material)
         saved = {"coefficients": torch.zeros(0, knots, size), "starts": torch.zeros(0, dtype=torch.int64)}
     return replace(material, futures=_futures(material, settings, saved["coefficients"], saved["starts"]))
-
-
-def begin_forecasts(agent: Agent, windows: Sequence[ForecastWindow], pasts: Tensor) -> tuple[Tensor, Tensor]:
-    """Where forecasts of ``windows`` begin: ``qpos [W, nq]`` and ``qvel [W, nv]``, placed where the reference is, feet
-    out of the floor.
-
-    That is the last state of ``pasts [W, context, S]``; where the agent follows kinematic forecasts, it is where those
-    begin, and from now on the agent follows, from these frames, the ones that have seen ``pasts`` alone.
-    """
-    material = agent.material
-    now = torch.tensor([int(material.takes.offsets[w.take]) + w.now for w in windows])
-    where = torch.as_tensor(material.reference["qpos"][now]).double()
-    humanoid = material.humanoid
-    if material.futures is None:
-        return placed_states(pasts[:, -1].numpy(), where.numpy(), humanoid)
-    curves = ForecastCurves(agent.config, material, agent.path.resolve().parent.parent)
-    material.futures.put(curves(pasts), now)
-    qpos, qvel = material.futures.first_state(now, where, humanoid.joint_range)
-    return torch.from_numpy(out_of_floor(humanoid, qpos.numpy())), qvel
 
 
 def still_futures(config: Mapping[str, Any], material: Material) -> Material:

@@ -21,7 +21,8 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
-from egopose.checkpoint.checkpoint import CHECKSUMS, ComponentState, RunCheckpoint, metadata_of, read_json, verify
+from egopose.checkpoint.checkpoint import ComponentState, RunCheckpoint, metadata_of, read_json, verify
+from egopose.checkpoint.checksums import CHECKSUMS
 from egopose.core.config import from_mapping
 from egopose.core.errors import InputError
 from egopose.core.safe_io import read_json as read_json_file

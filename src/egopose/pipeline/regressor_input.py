@@ -16,10 +16,11 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from egopose.checkpoint.body_parts import load_finder
 from egopose.data.preparation import video_of
 from egopose.data.store import TakeStore
 from egopose.models.predictions import Flow
-from egopose.vision.body_parts import LimbFinder, as_plane, load_finder
+from egopose.vision.body_parts import LimbFinder, as_plane
 from egopose.vision.features import extract_limbs
 from egopose.vision.flow import FlowConfig
 from egopose.vision.lens import Camera

@@ -1,20 +1,22 @@
-"""``python -m egopose.train [group=choice] [key=value] [resume=RUN_DIR] [--multirun]``: train a policy."""
+"""A training from its configuration to its last checkpoint: new, resumed, or a job of a sweep."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from egopose import pipeline
-from egopose.checkpoint.resume import FINISHED, continued_job, finished, mark_finished
-from egopose.evaluation.torchrl_evaluator import BackgroundSurvival
+from egopose.checkpoint.resume import FINISHED, continued_job, finished, mark_finished, only_process, resumed_config
+from egopose.core.errors import InputError
+from egopose.pipeline.dataset import absolute_paths, load_material, run_material
 from egopose.pipeline.forecaster import with_futures
-from egopose.pipeline.run import build_evaluation
+from egopose.pipeline.run import build_evaluation, build_run
 from egopose.tasks.dataset import Material
 from egopose.training.logging import build_loggers, write_provenance
-from egopose.training.loop import BackgroundEvaluation, Evaluation, Run, train
+from egopose.training.loop import TrainingStopped, train
+from egopose.training.ppo import TrainingDiverged
+
+#: What ends a run whose checkpoints are whole: it can be resumed.
+STOPPING = (TrainingDiverged, TrainingStopped, OSError)
 
 
 def run_training(
@@ -43,16 +45,15 @@ def run_training(
         (folder / FINISHED).unlink(missing_ok=True)
         print(f"run directory: {folder}", flush=True)
         if material is None:
-            material = pipeline.load_material(config) if checkpoint is None else pipeline.run_material(config, folder)
+            material = load_material(config) if checkpoint is None else run_material(config, folder)
         material = with_futures(config, material, folder)
-        run = pipeline.build_run(config, folder, material)
+        run = build_run(config, folder, material)
         try:
             if checkpoint is not None:
                 run.restore(checkpoint)
                 print(f"resuming {folder} after iteration {run.counters.iteration}", flush=True)
             loggers = build_loggers(config["logger"], folder, config, run.counters.iteration, run.counters.frames)
-            with _evaluation(run, material) as evaluation:
-                outcome = train(run, loggers, evaluation)
+            outcome = train(run, loggers, build_evaluation(run, material))
         finally:
             run.collector.shutdown()
     except KeyboardInterrupt:
@@ -65,20 +66,6 @@ def run_training(
     figures = {"reason": outcome.reason, "iteration": outcome.iteration, "score": run.counters.score}
     mark_finished(folder, config, figures)
     return run.counters.score
-
-
-@contextmanager
-def _evaluation(run: Run, material: Material) -> Iterator[Evaluation | BackgroundEvaluation]:
-    """As ``training.evaluate_async`` says: between iterations, or beside them."""
-    if not run.config["training"].get("evaluate_async") or not run.settings.evaluate_every:
-        yield build_evaluation(run, material)
-        return
-
-    background = BackgroundSurvival(run, material)
-    try:
-        yield background
-    finally:
-        background.close()
 
 
 def run_job(config: dict[str, Any], folder: Path, material: Material | None = None) -> float:
@@ -95,3 +82,32 @@ def run_job(config: dict[str, Any], folder: Path, material: Material | None = No
         print(f"{folder}: {done['reason']} already after {done['iteration']} iterations", flush=True)
         return float(done["score"])
     return run_training(config, folder, checkpoint, material)
+
+
+def start_run(config: dict[str, Any], folder: Path, multirun: bool, overrides: list[str]) -> float:
+    """What ``egopose train`` does with one configuration: a new run, one resumed, or one of a sweep.
+
+    Args:
+        config: resolved; its ``resume`` names a run directory to go on with.
+        folder: the run directory.
+        multirun: it is a job of a sweep.
+        overrides: as given on the command line.
+
+    Returns:
+        See :func:`run_training`.
+
+    Raises:
+        InputError: as :func:`run_training`; the directory holds a run already, or is another process's.
+    """
+    if config["resume"] is not None and multirun:
+        raise InputError("resume", str(config["resume"]), "is for one run; give a sweep the same hydra.sweep.dir again")
+    composed = absolute_paths(config)
+    with only_process(folder):
+        if multirun:
+            return run_job(composed, folder)
+        if config["resume"] is None:
+            if (folder / "config.yaml").exists():
+                raise InputError(folder, "run directory", f"holds a run; to go on with it: resume={folder}")
+            return run_training(composed, folder)
+        saved, checkpoint = resumed_config(folder, composed, overrides)
+        return run_training(saved, folder, checkpoint)

@@ -17,10 +17,10 @@ from torch import Tensor
 from egopose.core.atomic_write import write_text_whole
 from egopose.core.errors import InputError
 from egopose.core.safe_io import read_json
+from egopose.data.fragments import FragmentLike
 from egopose.data.store import TakeInfo
 from egopose.envs.problem import TakeTable
 from egopose.envs.reference_forecasts import Futures
-from egopose.envs.starts import FragmentLike
 from egopose.humanoid.model import HumanoidModel
 
 PROVENANCE = "provenance.json"

@@ -14,8 +14,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from egopose.checkpoint.body_parts import load_finder
 from egopose.core.errors import InputError
-from egopose.core.runtime import torch_threads
+from egopose.core.torch_settings import torch_threads
 from egopose.data.spans import Span, without_block
 from egopose.humanoid.model import HumanoidModel
 from egopose.models.blended import MeanOfKernels, TimeWindows, blended_regressor, kernel_view
@@ -24,7 +25,6 @@ from egopose.models.mirror import StateMirror, state_mirror
 from egopose.models.predictions import Flow, take_frames
 from egopose.models.regressor import StateRegressor
 from egopose.models.regressor_settings import RegressorSettings
-from egopose.vision.body_parts import load_finder
 from egopose.vision.encoders import FLOW_CHANNELS
 
 

@@ -20,7 +20,7 @@ from torch.nn import functional
 from egopose.checkpoint.checkpoint import ComponentState, RunCheckpoint, metadata_of, read_json
 from egopose.core.config import from_mapping
 from egopose.core.errors import InputError
-from egopose.core.runtime import torch_threads
+from egopose.core.torch_settings import torch_threads
 from egopose.models.mirror import StateMirror, joint_mirror
 from egopose.motion.skeleton import Skeleton
 from egopose.vision.body_part_pictures import BODIES, posture_names

@@ -2,60 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Sequence
 
 from torch import Tensor
 
-from egopose.core.config import from_mapping
-from egopose.core.errors import InputError
 from egopose.data.spans import Span
 from egopose.models.mirror import StateMirror
 from egopose.models.motion_forecast import ContinuedForecaster, spline_times
-from egopose.training.fitting import FitResult, FitSettings, fit
-from egopose.training.motion_forecast import ForecasterSettings
-from egopose.training.recurrent_baselines import RecurrentLearner, RecurrentSettings, build_forecaster
-
-
-@dataclass(frozen=True)
-class ContinuedSettings:
-    """The group ``continued`` of ``conf/forecaster``.
-
-    Args:
-        share: of its curve at the first frame; the rest is the others'.
-        until: frames after which, in a straight line, that is nothing.
-        total_frames: of motion it learns from, counted as often as they are seen.
-        network: as one of ``conf/baseline``.
-        optimiser: its own.
-    """
-
-    share: float
-    until: int
-    total_frames: int
-    network: RecurrentSettings
-    optimiser: FitSettings
-
-    @classmethod
-    def from_config(cls, values: Mapping[str, Any], source: str) -> ContinuedSettings:
-        """Raises InputError: a key is missing, unknown or out of range; names it."""
-        network = dict(values.get("network") or {})
-        optimiser = network.pop("optimiser", None)
-        if network.pop("kind", None) != "recurrent" or optimiser is None:
-            raise InputError(source, "network", "must be a recurrent one of conf/baseline, its optimiser included")
-        parts = {
-            "network": RecurrentSettings.from_config(network, f"{source} network"),
-            "optimiser": FitSettings.from_config(optimiser),
-        }
-        return from_mapping(cls, {**values, **parts}, source)
-
-    def __post_init__(self) -> None:
-        if not 0 < self.share <= 1:
-            raise InputError("conf/forecaster continued", "share", f"must lie in (0, 1], not {self.share}")
-        for name in ("until", "total_frames"):
-            if getattr(self, name) < 1:
-                cause = f"must be at least 1, not {getattr(self, name)}"
-                raise InputError("conf/forecaster continued", name, cause)
+from egopose.training.fitting import FitResult, fit
+from egopose.training.forecaster_settings import ForecasterSettings
+from egopose.training.recurrent_baselines import RecurrentLearner, build_forecaster
 
 
 def fit_continued_forecaster(

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from egopose.core.config import from_mapping
 from egopose.core.errors import InputError
-from egopose.core.runtime import torch_threads
+from egopose.core.torch_settings import torch_threads
 
 State = dict[str, Tensor]
 

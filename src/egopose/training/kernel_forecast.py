@@ -14,45 +14,7 @@ from egopose.models.kernel_regression import KernelRegression, fit_kernel_regres
 from egopose.models.mirror import StateMirror
 from egopose.models.motion_forecast import KernelForecaster, spline_basis
 from egopose.models.regressor import state_statistics
-from egopose.training.motion_forecast import ForecasterSettings
-
-
-@dataclass(frozen=True)
-class KernelSettings:
-    """The group ``kernel`` of ``conf/forecaster``.
-
-    Args:
-        bins: see :class:`KernelForecaster`; they add up to the context.
-        axes, whitening, ridge, length: see :func:`egopose.models.kernel_regression.fit_kernel_regression`.
-        centres: moments of training remembered at most, evenly chosen; half of them are mirror images.
-        share: of its curve; the rest is the networks'.
-        added: share of what the likest moments add to the shares of last and mean pose.
-        least: frames of the future that a moment must have to be remembered; a take's last pose stands for the rest.
-        kept_ridge: of the shares of last and mean pose, in their variance.
-    """
-
-    bins: tuple[int, ...]
-    axes: int
-    whitening: float
-    ridge: float
-    length: float
-    centres: int
-    share: float
-    added: float
-    least: int
-    kept_ridge: float
-
-    def __post_init__(self) -> None:
-        def check(ok: bool, name: str, cause: str) -> None:
-            if not ok:
-                raise InputError("conf/forecaster kernel", name, cause)
-
-        check(bool(self.bins) and min(self.bins) > 0, "bins", "must be positive")
-        check(self.axes > 0 and self.least > 0, "axes", "must be positive, as must least")
-        check(min(self.ridge, self.length, self.kept_ridge) > 0, "ridge", "must be positive, as must the others")
-        check(self.centres >= 4, "centres", "must be at least 4")
-        check(0 < self.share < 1, "share", "must lie between 0 and 1")
-        check(0 < self.added <= 1, "added", "must lie in (0, 1]")
+from egopose.training.forecaster_settings import ForecasterSettings
 
 
 @dataclass(frozen=True)

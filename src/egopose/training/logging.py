@@ -31,10 +31,6 @@ class Scalars(Protocol):
 
     def write(self, step: int, figures: Mapping[str, float]) -> None: ...
 
-    def amend(self, step: int, figures: Mapping[str, float]) -> None:
-        """Add to what was written at ``step``."""
-        ...
-
     def close(self) -> None: ...
 
 
@@ -68,14 +64,6 @@ class CsvCurves:
         with self.path.open("a", newline="") as stream:
             csv.DictWriter(stream, self.columns).writerow(row)
 
-    def amend(self, step: int, figures: Mapping[str, float]) -> None:
-        """Into the row of ``step``. Rows of what a resumed run has not redone yet are not there: nothing is amended."""
-        for row in self.rows:
-            if int(row["steps"]) == step:
-                row |= figures
-                self.columns += [name for name in figures if name not in self.columns]
-                self._rewrite()
-
     def close(self) -> None:
         """Nothing is held open."""
 
@@ -106,9 +94,6 @@ class TensorBoardScalars:
         for name, value in figures.items():
             self.writer.add_scalar(name, value, step)
 
-    def amend(self, step: int, figures: Mapping[str, float]) -> None:
-        self.write(step, figures)
-
     def close(self) -> None:
         self.writer.close()
 
@@ -125,10 +110,6 @@ class WandbScalars:
 
     def write(self, step: int, figures: Mapping[str, float]) -> None:
         self.run.log(dict(figures), step=step)
-
-    def amend(self, step: int, figures: Mapping[str, float]) -> None:
-        """With the next step's figures, for steps only go up there; ``evaluation/step`` says whose they are."""
-        self.run.log({**figures, "evaluation/step": step})
 
     def close(self) -> None:
         self.run.finish()

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from multiprocessing import resource_tracker
 from pathlib import Path
 from types import FrameType
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
@@ -28,19 +28,6 @@ from egopose.training.logging import ProgressLine, Scalars
 from egopose.training.ppo import PPO, TrainingDiverged
 
 Evaluation = Callable[[int], Mapping[str, float]]
-
-
-@runtime_checkable
-class BackgroundEvaluation(Protocol):
-    """An evaluation that goes on beside the training."""
-
-    def begin(self, step: int) -> None:
-        """Evaluate the present weights, to be told as of ``step``."""
-        ...
-
-    def finished(self, wait: bool = False) -> list[tuple[int, dict[str, float]]]:
-        """Steps and figures of what has come to its end since the last call; with ``wait``, of all that was begun."""
-        ...
 
 
 class TrainingStopped(RuntimeError):
@@ -213,7 +200,7 @@ class _TransformState:
         collectors.load_transform_state(self.collector, state)
 
 
-def train(run: Run, loggers: Sequence[Scalars], evaluate: Evaluation | BackgroundEvaluation | None = None) -> Outcome:
+def train(run: Run, loggers: Sequence[Scalars], evaluate: Evaluation | None = None) -> Outcome:
     """Train until a budget is used up or a stop is asked for; always leaves a checkpoint of the last whole iteration.
 
     Args:
@@ -221,9 +208,7 @@ def train(run: Run, loggers: Sequence[Scalars], evaluate: Evaluation | Backgroun
         loggers: get every iteration's figures.
         evaluate: called every ``evaluate_every`` iterations with the iteration's number; its figures are logged under
             ``evaluation/``, and its ``score``, if it gives one, decides which checkpoint is the best (otherwise the
-            mean episode length in training does); what was judged is saved at once. One in the background is begun
-            then; its figures are logged at the step it was begun at once they are there, and its score counts for the
-            next checkpoint saved.
+            mean episode length in training does); what was judged is saved at once.
 
     Raises:
         TrainingDiverged: see :meth:`PPO.update` and :meth:`Run.save`.
@@ -245,13 +230,11 @@ def train(run: Run, loggers: Sequence[Scalars], evaluate: Evaluation | Backgroun
                 figures |= judged
                 for logger in loggers:
                     logger.write(counters.frames, figures)
-                _log_finished(run, loggers, evaluate)
                 progress.update(counters.iteration, figures)
                 if judged or counters.iteration % settings.checkpoint_every == 0:
                     run.save()
                 slowest = max(slowest, time.monotonic() - started)
                 counters.seconds += time.monotonic() - started
-            _log_finished(run, loggers, evaluate, wait=True)
             return Outcome(reason, counters.iteration, counters.frames, run.save())
         except TrainingDiverged as error:
             # Nothing of it is saved: some of this iteration's gradient steps may have been the ones that led here.
@@ -288,9 +271,7 @@ def _not_finite(state: Any, name: str) -> str | None:
     return None
 
 
-def _judge(
-    run: Run, figures: Mapping[str, float], evaluate: Evaluation | BackgroundEvaluation | None
-) -> dict[str, float]:
+def _judge(run: Run, figures: Mapping[str, float], evaluate: Evaluation | None) -> dict[str, float]:
     """Evaluate where it is due; keeps the score of the last evaluation, or of training where there is none."""
     counters, every = run.counters, run.settings.evaluate_every
     if evaluate is None or every == 0:
@@ -298,32 +279,12 @@ def _judge(
         return {}
     if counters.iteration % every != 0:
         return {}
-    if isinstance(evaluate, BackgroundEvaluation):
-        evaluate.begin(counters.frames)
-        return {}
     # An evaluation draws (and TorchRL seeds) random numbers; training's own must not notice.
     with torch.random.fork_rng(devices=[]):
         result = dict(evaluate(counters.iteration))
     if "score" in result:
         counters.score, counters.scored = result["score"], True
-    return _evaluation_figures(result)
-
-
-def _evaluation_figures(result: Mapping[str, float]) -> dict[str, float]:
     return {f"evaluation/{name}": value for name, value in result.items()}
-
-
-def _log_finished(
-    run: Run, loggers: Sequence[Scalars], evaluate: Evaluation | BackgroundEvaluation | None, wait: bool = False
-) -> None:
-    """Log what evaluations in the background have found, at the steps they were begun at."""
-    if not isinstance(evaluate, BackgroundEvaluation):
-        return
-    for step, result in evaluate.finished(wait):
-        if "score" in result:
-            run.counters.score, run.counters.scored = result["score"], True
-        for logger in loggers:
-            logger.amend(step, _evaluation_figures(result))
 
 
 def iterate(run: Run, batches: Iterator[TensorDictBase]) -> dict[str, float]:

@@ -3,78 +3,18 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from typing import Any
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
 
-from egopose.core.config import from_mapping
 from egopose.core.errors import InputError
 from egopose.data.spans import Span, split_validation, without_block
 from egopose.models.mirror import StateMirror
 from egopose.models.motion_forecast import MotionForecaster, spline_basis
 from egopose.models.regressor import state_statistics
-from egopose.training.continued_forecast import ContinuedSettings
-from egopose.training.kernel_forecast import Contexts, KernelSettings
-
-
-@dataclass(frozen=True)
-class ForecasterSettings:
-    """The group ``conf/forecaster``, without its ``optimiser``.
-
-    Args:
-        recurrent, hidden, dropout: see :class:`MotionForecaster`.
-        spacing: frames between the curve's knots.
-        context, horizon: frames seen and frames forecast.
-        std_floor: of the deviations poses are divided by.
-        input_noise: deviations added to each context, one draw a number, and as much again a frame.
-        other_weight: of the squared error, in deviations, of what E_pose does not see: height, root velocities, hands.
-        cross_fit: forecasters for the training frames, each of which has not seen its own part of them: people where
-            people are held out for testing, else blocks of time.
-        members: networks whose curves are averaged.
-        total_frames: of motion each network learns from, counted as often as they are seen.
-        kernel: of the kernel regression beside the networks, or None for networks alone.
-        continued: of the network beside both that goes on frame by frame, or None for none.
-    """
-
-    recurrent: int
-    hidden: int
-    dropout: float
-    spacing: int
-    context: int
-    horizon: int
-    std_floor: float
-    input_noise: float
-    other_weight: float
-    cross_fit: int
-    members: int
-    total_frames: int
-    kernel: KernelSettings | None = None
-    continued: ContinuedSettings | None = None
-
-    @classmethod
-    def from_config(cls, values: Mapping[str, Any], source: str = "conf/forecaster") -> ForecasterSettings:
-        """Raises InputError: a key is missing, unknown or out of range; names it."""
-        own = {key: value for key, value in values.items() if key not in ("kernel", "continued")}
-        settings = from_mapping(cls, own, source)
-        if values.get("kernel") is not None:
-            kernel = from_mapping(KernelSettings, values["kernel"], f"{source} kernel")
-            settings = replace(settings, kernel=kernel)
-            if sum(kernel.bins) != settings.context:
-                cause = f"must add up to the context's {settings.context} frames, not {sum(kernel.bins)}"
-                raise InputError(f"{source} kernel", "bins", cause)
-        if values.get("continued") is not None:
-            continued = ContinuedSettings.from_config(values["continued"], f"{source} continued")
-            settings = replace(settings, continued=continued)
-        if settings.context > settings.horizon:  # what is left out about a block is as wide as the horizon
-            raise InputError(source, "context", f"must be at most the horizon, {settings.horizon} frames")
-        least = {"recurrent": 1, "hidden": 1, "spacing": 1, "context": 1, "horizon": 2, "cross_fit": 2, "members": 1}
-        for name, value in least.items():
-            if getattr(settings, name) < value:
-                raise InputError(source, name, f"must be at least {value}, not {getattr(settings, name)}")
-        return settings
+from egopose.training.forecaster_settings import ForecasterSettings
+from egopose.training.kernel_forecast import Contexts
 
 
 def build_forecaster(

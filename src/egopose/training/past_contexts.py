@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from egopose.core.runtime import torch_threads
+from egopose.core.torch_settings import torch_threads
 from egopose.data.spans import Span, without_block
 from egopose.humanoid.model import HumanoidModel
 from egopose.models.blended import MeanOfKernels

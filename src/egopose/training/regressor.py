@@ -16,7 +16,7 @@ import torch
 from torch import Tensor, nn
 
 from egopose.core.errors import InputError
-from egopose.core.runtime import torch_threads
+from egopose.core.torch_settings import torch_threads
 from egopose.data.spans import Span, Window, split_validation, training_windows
 from egopose.models.mirror import StateMirror
 from egopose.models.predictions import Flow, predict_span, take_frames

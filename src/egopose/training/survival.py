@@ -12,7 +12,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from egopose.envs.env import EgoPoseEnv
 from egopose.envs.problem import ImitationProblem
-from egopose.inference.estimator import Controller, prepare_for_test
+from egopose.envs.test_time import Controller, prepare_for_test
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ import numpy as np
 from egopose.core.errors import InputError
 from egopose.core.safe_io import read_json
 from egopose.data.prepare_motion import without_lead_in
-from egopose.evaluation.report import FOOTAGE
+from egopose.inference.outputs import FOOTAGE
 from egopose.motion.io import read_motion
 from egopose.motion.motion import Motion
 from egopose.motion.rotations import Array

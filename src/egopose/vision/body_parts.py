@@ -7,7 +7,6 @@ and rooms (``python -m egopose.limbs``), on no frame of any take that anything i
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Sequence
 
 import numpy as np
@@ -16,23 +15,33 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional
 
-from egopose.checkpoint.checkpoint import RunCheckpoint, read_json
-from egopose.checkpoint.pretrained import FOLDER
-from egopose.core.errors import InputError
 from egopose.vision.flow import centred_square
 from egopose.vision.video import Frame
 
 #: Side in pixels of the pictures it looks at, and of the flow (conf/vision/light.yaml's stored size).
 PICTURE, FLOW = 64, 32
+
+
 #: Classes of the masks.
 LIMBS = ("right arm", "left arm", "right leg", "left leg", "trunk")
+
+
 #: Least and largest logarithm of a variance that a finder gives.
 LOG_VARIANCE = (-4.0, 3.0)
+
+
 _FLOW_SCALE = 20.0  # as conf/vision/light.yaml: flow in widths a frame, times this, is of order one
+
+
 _SUMMARY = 256
+
+
 _BATCH = 256  # frames a forward pass
 
+
 Picture = NDArray[np.uint8]
+
+
 """``[64, 64, 3]`` RGB, see :func:`small_picture`."""
 
 
@@ -114,31 +123,6 @@ class LimbFinder(nn.Module):
         # A variance is in squares of its number's own deviation.
         scale = 2.0 * torch.log(self.std[self.mirror_index] / self.std)
         return torch.cat([(posture - self.mean) / self.std, log_variance[..., self.mirror_index] + scale], -1)
-
-
-@functools.cache
-def load_finder(name: str) -> LimbFinder:
-    """A finder that comes with the package, in evaluation mode.
-
-    Args:
-        name: of its folder in ``egopose/weights``.
-
-    Raises:
-        InputError: there is no such finder, or a file of it is damaged.
-    """
-
-    folder = FOLDER / name
-    # A name from a stranger's configuration must not lead out of the package.
-    if folder.parent != FOLDER or name in (".", "..") or not (folder / "manifest.json").is_file():
-        raise InputError("regressor.kernel", "limbs", f"no limb finder {name!r} comes with egopose")
-    config = read_json(folder, "config")
-    finder = LimbFinder(len(config["names"]), int(config["channels"]))
-    if "mirror" not in config:
-        raise InputError(folder, "mirror", "is missing: the finder was made by an older egopose")
-    for key, buffer in (("index", finder.mirror_index), ("sign", finder.mirror_sign)):
-        buffer.copy_(torch.tensor(config["mirror"][key]))
-    RunCheckpoint({"finder": finder}).restore(folder, {"finder"})
-    return finder.eval()
 
 
 def small_picture(frame: Frame) -> Picture:

@@ -25,13 +25,14 @@ from egopose.data.store import TakeStore
 from egopose.humanoid.model import HumanoidModel
 from egopose.inference.causal import CausalRegression
 from egopose.inference.failsafe import FailSafeSettings
+from egopose.inference.stream import live_forecasts, loop
 from egopose.inference.stream.forecasting import ForecastThread
 from egopose.inference.stream.frame_features import Sight
 from egopose.inference.stream.frame_sources import ReconnectSettings, SourceSettings, check_source
 from egopose.inference.stream.latency import LatencyTable
 from egopose.inference.stream.live_body import LiveBody
-from egopose.inference.stream.live_forecasts import STAGES, ForecastSettings, LiveFutures, Moment
-from egopose.inference.stream.loop import STAGES, LiveLoop, LoopSettings
+from egopose.inference.stream.live_forecasts import ForecastSettings, LiveFutures, Moment
+from egopose.inference.stream.loop import LiveLoop, LoopSettings
 from egopose.inference.stream.outputs import check_outputs, open_outputs
 from egopose.inference.video_regression import causal_regression, run_folder, seen_in, video_material
 from egopose.models.regressor import StateRegressor
@@ -186,7 +187,7 @@ def build_loop(
     flow = FlowConfig(**dict(trained.made_with["vision"]["flow"]))
     camera = Camera.from_mapping(values["camera"], "camera")
     rate = 1.0 / trained.humanoid.control_dt
-    latency = LatencyTable(STAGES, values["latency_frames"])
+    latency = LatencyTable(loop.STAGES, values["latency_frames"])
 
     def parts(lap: Callable[[str], None]) -> tuple[Sight, CausalRegression, LiveBody]:
         """As at the start: nothing seen yet."""
@@ -208,7 +209,7 @@ def _forecasts(values: Mapping[str, Any], forecaster: Forecaster, fallen_height:
     settings = forecaster.settings
     every = max(round(settings.every * rate), 1)
     capacity = max(values["latency_frames"] // every, 1)
-    latency = LatencyTable(STAGES, capacity, ("forecast", "forecast_delay"))
+    latency = LatencyTable(live_forecasts.STAGES, capacity, ("forecast", "forecast_delay"))
 
     made = forecaster
     futures = LiveFutures(made.env, made.actor, made.regressor, settings, fallen_height, made.curves)

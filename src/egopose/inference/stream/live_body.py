@@ -19,10 +19,10 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from egopose.core.errors import InputError
 from egopose.envs.env import EgoPoseEnv
+from egopose.envs.test_time import prepare_for_test
 from egopose.envs.transforms import StateNormalizer, TrackingError
 from egopose.humanoid.foot_geometry import out_of_floor
 from egopose.inference.causal import Seen
-from egopose.inference.estimator import prepare_for_test
 from egopose.inference.failsafe import FailSafe, FailSafeSettings
 from egopose.models.context import BidirectionalContext, LstmState
 from egopose.models.episode_context import EpisodeContext

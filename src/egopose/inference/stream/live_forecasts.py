@@ -22,9 +22,9 @@ from torchrl.modules import LSTMModule
 from egopose.core.errors import InputError
 from egopose.envs.env import EgoPoseEnv
 from egopose.envs.reference_forecasts import FollowFuture
+from egopose.envs.test_time import prepare_for_test
 from egopose.envs.transforms import StateNormalizer
 from egopose.inference.bands import quantile_bands
-from egopose.inference.estimator import prepare_for_test
 from egopose.inference.stream.guides import Curves, Guide, guide_of, parts_of
 from egopose.models.policy import GaussianHead
 from egopose.models.regressor import StateRegressor

@@ -1,0 +1,48 @@
+"""What ``egopose evaluate`` does: load the runs, score them as their task asks, write the page."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from egopose.evaluation.estimation_run import run_evaluation, summary
+from egopose.evaluation.forecast_run import run_forecast_evaluation
+from egopose.evaluation.options import data_at, output_folder, physics_group
+from egopose.evaluation.reports import evaluation_report
+from egopose.evaluation.reset_threshold import choose_threshold
+from egopose.evaluation.take_videos import take_videos
+from egopose.pipeline.agent import load_agent
+from egopose.vision.corruption import Corruption
+
+
+def evaluate(values: Mapping[str, Any]) -> str:
+    """Score the checkpoints that ``conf/evaluate.yaml`` names, and write all files.
+
+    Args:
+        values: ``conf/evaluate.yaml``, resolved.
+
+    Returns:
+        What the terminal shows.
+
+    Raises:
+        InputError: a checkpoint, the data or a setting cannot be used; names it.
+    """
+    if values["reset_threshold"]["choose"]:
+        return choose_threshold(values)
+    given = values["checkpoint"]
+    paths = [str(p) for p in given] if isinstance(given, list) else [str(given)]
+    overrides = physics_group(values["physics"]) or {}
+    overrides |= {"corruption": values["corruption"]} if "corruption" in values else {}
+    which, data = str(values["which"]), values["data_folder"]
+    agents = [load_agent(path, which=which, overrides=overrides | data_at(data, path, which)) for path in paths]
+    names, videos = take_videos(agents[0].config)
+    spoilt = Corruption.from_config(values) is not None
+    part = f"{values['split']}-corrupted" if spoilt else str(values["split"])
+    out = output_folder(values["out"], agents[0].path, part)
+    if agents[0].config["task"]["name"] == "forecasting":
+        text = run_forecast_evaluation(values, agents, names, videos, out)
+    else:
+        text = summary(run_evaluation(values, agents, names, videos, out))
+    if values["report"]:
+        text += f"\nreport: {evaluation_report(out, agents[0].material.humanoid)}"
+    return text

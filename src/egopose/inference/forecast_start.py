@@ -1,0 +1,37 @@
+"""From a configuration to the kinematic forecasts a policy follows: trained once a run, kept in ``RUN_DIR/forecaster``.
+
+Forecasts that begin at training frames are those of networks that have not seen the frames around them, nor any they
+forecast: a policy must not trust them more than it may on new takes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from egopose.data.windows import ForecastWindow
+from egopose.humanoid.foot_geometry import out_of_floor
+from egopose.models.placed_states import placed_states
+from egopose.pipeline.agent import Agent
+from egopose.pipeline.forecaster import ForecastCurves
+
+
+def begin_forecasts(agent: Agent, windows: Sequence[ForecastWindow], pasts: Tensor) -> tuple[Tensor, Tensor]:
+    """Where forecasts of ``windows`` begin: ``qpos [W, nq]`` and ``qvel [W, nv]``, placed where the reference is, feet
+    out of the floor.
+
+    That is the last state of ``pasts [W, context, S]``; where the agent follows kinematic forecasts, it is where those
+    begin, and from now on the agent follows, from these frames, the ones that have seen ``pasts`` alone.
+    """
+    material = agent.material
+    now = torch.tensor([int(material.takes.offsets[w.take]) + w.now for w in windows])
+    where = torch.as_tensor(material.reference["qpos"][now]).double()
+    humanoid = material.humanoid
+    if material.futures is None:
+        return placed_states(pasts[:, -1].numpy(), where.numpy(), humanoid)
+    curves = ForecastCurves(agent.config, material, agent.path.resolve().parent.parent)
+    material.futures.put(curves(pasts), now)
+    qpos, qvel = material.futures.first_state(now, where, humanoid.joint_range)
+    return torch.from_numpy(out_of_floor(humanoid, qpos.numpy())), qvel

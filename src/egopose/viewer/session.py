@@ -1,0 +1,61 @@
+"""From the words of a command to a viewer that serves: of files, or of a live stream."""
+
+from __future__ import annotations
+
+import secrets
+from collections.abc import Sequence
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from egopose.core.errors import InputError
+from egopose.vision.video import probe_video
+
+if TYPE_CHECKING:
+    from egopose.viewer.app import Viewer
+    from egopose.viewer.live import LiveViewer
+
+_LIVE = ("ws://", "wss://")
+
+
+def is_source(word: str) -> bool:
+    """Whether a word of the command names a stream or a file, and no setting."""
+    return word.startswith(_LIVE) or Path(word).exists()
+
+
+def open_viewer(
+    words: Sequence[str], video: Path | None, offset: float | None, address: str, port: int, token: str | None
+) -> Viewer | LiveViewer:
+    """A viewer that serves from now on.
+
+    Args:
+        words: sources, and overrides ``key=value`` of ``conf/sync.yaml``.
+        video: the wearer's MP4, of a source that is one motion.
+        offset: s, the motion's time 0 in the video; None to find it.
+        address, port: to listen at.
+        token: who may look; ``new`` makes one.
+
+    Raises:
+        InputError: viser is not installed, or a source cannot be shown.
+    """
+    if find_spec("viser") is None:
+        raise InputError("view", "viser", "is not installed; pip install 'egopose[view]'")
+    from egopose.viewer.app import Viewer
+    from egopose.viewer.auth_proxy import Address
+    from egopose.viewer.clip import Footage
+    from egopose.viewer.clip_sources import read_runs
+    from egopose.viewer.live import LiveViewer
+
+    overrides = [word for word in words if "=" in word and not is_source(word)]
+    sources = [word for word in words if word not in overrides]
+    if not sources:
+        raise InputError("view", "source", "none is named: a motion file, an evaluation, a run or ws:// address")
+    place = Address(address, port, secrets.token_hex(16) if token == "new" else token)
+    if sources[0].startswith(_LIVE):
+        if len(sources) > 1:
+            raise InputError("view", "source", "a live stream is shown by itself; name nothing beside it")
+        return LiveViewer(sources[0], place)
+    footage = None if video is None else Footage(video, offset or 0.0)
+    if footage is not None:
+        probe_video(footage.path)
+    return Viewer(read_runs(sources, footage), place, offset is None, overrides)

@@ -1,0 +1,662 @@
+"""Looking ahead: the body stays up longer, values are what a plain simulation gives, and nothing else is touched."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cache
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from env_stand_in import environment, group
+from humanoid_stand_in import StandIn, reference_motion, stand_in
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModule
+from torch import Tensor
+from torchrl.envs import Compose, TransformedEnv
+
+from egopose.core.config import compose_config
+from egopose.core.errors import InputError
+from egopose.core.torch_settings import prefer_quick_products
+from egopose.envs.build import build_problem
+from egopose.envs.env import EgoPoseEnv
+from egopose.envs.forecasting_transforms import RecurrentStates
+from egopose.envs.mdp.observations import humanoid_state
+from egopose.envs.starts import Piece
+from egopose.envs.transforms import StateNormalizer
+from egopose.evaluation.agents import estimate_and_judge
+from egopose.inference.estimator import Estimate, estimate_takes
+from egopose.inference.failsafe import FailSafe, FailSafeSettings
+from egopose.inference.planner import Planner
+from egopose.inference.planner_settings import PlannerSettings, planner_settings
+from egopose.inference.video import allowed_planner
+
+FRAMES = 60
+PIECES = (Piece(0, 0, FRAMES), Piece(1, 0, FRAMES))
+#: A search in one round, its best way taken.
+SMALL = {
+    "samples": 12,
+    "rounds": 1,
+    "near": 0.0,
+    "horizon": 8,
+    "every": 8,
+    "knot": 3,
+    "acceleration": 0.001,
+    "rescue": 0,
+}
+humanoid = cache(stand_in)
+
+
+def settings(**changed: Any) -> PlannerSettings:
+    """``conf/planner/ahead.yaml`` but for what is given."""
+    made = planner_settings({**compose_config("evaluate", ["checkpoint=none"])["planner"], **changed})
+    assert made is not None
+    return made
+
+
+@cache
+def true_motion() -> tuple[TensorDict, Any]:
+    return reference_motion(humanoid(), (FRAMES, FRAMES))
+
+
+def other_motion() -> TensorDict:
+    """Each take backwards: body states, but of other frames."""
+    reference, _ = true_motion()
+    return torch.cat([take.flip(0) for take in reference.split(FRAMES)])
+
+
+def states_of(reference: TensorDict) -> Tensor:
+    return humanoid_state(reference).float()
+
+
+def make_env(worlds: int, reference: TensorDict | None = None, threads: int = 1, **action: Any) -> TransformedEnv:
+    known, takes = true_motion()
+    task = group("task", "estimation")
+    task = task | {"termination": {"enabled": False, "head_drop": 0.1}, "action": task["action"] | action}
+    body: StandIn = humanoid()
+    problem = build_problem(body, known if reference is None else reference, takes, task, group("reward", "estimation"))
+    base = environment(worlds, problem=problem, fragments=PIECES, whole_fragments=True, threads=threads)
+    return TransformedEnv(base, Compose(StateNormalizer(base.observation_spec["humanoid_state"].shape[-1])))
+
+
+def base_of(env: TransformedEnv) -> EgoPoseEnv:
+    assert isinstance(env.base_env, EgoPoseEnv)
+    return env.base_env
+
+
+def frozen(env: TransformedEnv) -> TransformedEnv:
+    env.transform[0].freeze()
+    return env
+
+
+def actor() -> TensorDictModule:
+    """A policy that reacts to the state, a little."""
+    size = humanoid().mj_model.nu
+    return TensorDictModule(lambda z: 0.05 * torch.sin(z[:, :size]), in_keys=["humanoid_state"], out_keys=["action"])
+
+
+def passive() -> TensorDictModule:
+    size = humanoid().mj_model.nu
+    return TensorDictModule(lambda z: torch.zeros(len(z), size), in_keys=["humanoid_state"], out_keys=["action"])
+
+
+def critic() -> TensorDictModule:
+    return TensorDictModule(lambda z: 2.0 + z[:, :1], in_keys=["humanoid_state"], out_keys=["state_value"])
+
+
+def planner_for(
+    worlds: int,
+    states: Tensor,
+    policy: TensorDictModule | None = None,
+    env: dict[str, Any] | None = None,
+    **changed: Any,
+) -> Planner:
+    chosen = settings(**{**SMALL, **changed})
+    copies = frozen(make_env(worlds * chosen.samples, **(env or {})))
+    return Planner(copies, policy or actor(), critic(), states, chosen)
+
+
+def leaning(env: TransformedEnv, steps: int = 3) -> EgoPoseEnv:
+    """Bodies some frames after their start, not where the reference has them."""
+    frozen(env).reset()
+    base, generator = base_of(env), torch.Generator().manual_seed(1)
+    for _ in range(steps):
+        action = 0.2 * torch.randn(base.batch_size[0], humanoid().mj_model.nu, generator=generator)
+        env.step(TensorDict({"action": action}, base.batch_size))
+    return base
+
+
+def simulated(base: EgoPoseEnv, way: Tensor, followed: TensorDict, chosen: PlannerSettings) -> tuple[Tensor, Tensor]:
+    """What ``way [N, H, nu]`` is worth from where ``base`` is, and the score it is chosen by, one step after another.
+
+    The motion that is followed is the reference here, so the environment's own reward and heads are the planner's.
+    """
+    env = frozen(make_env(base.batch_size[0], followed))
+    env.reset()
+    here = base_of(env)
+    here.load_state_dict(base.state_dict())
+    observation, worth, cost = env.transform(here.observe()), 0.0, 0.0
+    for step in range(way.shape[1]):
+        before = here.body_state()["qvel"]
+        observation = actor()(observation)
+        observation["action"] = observation["action"] + way[:, step]
+        after = env.step(observation)["next"]
+        body, frame = here.body_state(), after["frame"].squeeze(-1)
+        head = humanoid().head
+        low = (followed["xpos"][frame, head, 2] - body["xpos"][:, head, 2]).clamp(min=0)
+        change = 30.0 * (body["qvel"] - before).abs().mean(1)
+        worth = worth + chosen.discount**step * after["reward"].squeeze(-1)
+        cost = cost + chosen.discount**step * (chosen.acceleration * change + chosen.head * low)
+        observation = after.exclude("reward", "action")
+    worth = worth + chosen.discount ** way.shape[1] * critic()(observation)["state_value"].squeeze(-1)
+    env.close()
+    return worth, worth - cost
+
+
+def whole_way(planner: Planner, base: EgoPoseEnv) -> Tensor:
+    """The way that was chosen, ``[N, H, nu]``: a planner that plans once in a horizon gives it out step by step."""
+    assert planner.settings.every == planner.settings.horizon
+    return torch.stack([planner.addition(base) for _ in range(planner.settings.horizon)], dim=1)
+
+
+def run(planner: Planner | None, states: Tensor, policy: TensorDictModule) -> list[Estimate]:
+    guard = FailSafe(len(PIECES), FailSafeSettings("off", kappa=0.6, fallen_height=0.3))
+    return estimate_takes(make_env(len(PIECES)), policy, critic(), states, guard, planner=planner)
+
+
+def test_a_body_that_falls_alone_stays_up_longer() -> None:
+    states = states_of(true_motion()[0])
+    alone = run(None, states, passive())
+    planner = planner_for(2, states, passive(), samples=32, horizon=16, every=4, knot=5)
+    ahead = run(planner, states, passive())
+    for one, other in zip(alone, ahead, strict=True):
+        np.testing.assert_array_equal(one.qpos[0], other.qpos[0])
+        assert one.fallen.any()
+        upright = np.argmax(other.fallen) if other.fallen.any() else FRAMES
+        assert upright > 1.3 * np.argmax(one.fallen)
+
+
+@pytest.mark.parametrize("rounds", [1, 3])
+def test_the_value_is_what_a_plain_simulation_of_the_chosen_way_is_worth(rounds: int) -> None:
+    followed = other_motion()
+    base = leaning(make_env(2))
+    planner = planner_for(2, states_of(followed), rounds=rounds)
+    worth, score = simulated(base, whole_way(planner, base), followed, planner.settings)
+    torch.testing.assert_close(planner.value, worth.float(), rtol=0, atol=1e-4)
+    nothing = torch.zeros(2, planner.settings.horizon, humanoid().mj_model.nu)
+    policy_alone = simulated(base, nothing, followed, planner.settings)
+    assert (score >= policy_alone[1] - 1e-4).all()
+    assert (score > policy_alone[1] + 1e-2).any()  # or there was nothing to choose between
+
+
+def test_a_body_that_lies_where_it_should_stand_is_worth_nothing() -> None:
+    states, env = true_motion()[0], make_env(3)
+    base = leaning(env)
+    followed = humanoid_state(states).float()
+    plain, lost = (planner_for(3, followed, lost=limit) for limit in (9.0, 0.3))
+    body = base.body_state()
+    qpos = body["qpos"].clone()
+    qpos[1, 2] -= 0.35
+    base.place(torch.arange(3), qpos, body["qvel"])
+    for planner in (plain, lost):
+        planner.addition(base)
+    assert (plain.value != 0).all()
+    torch.testing.assert_close(lost.value[[0, 2]], plain.value[[0, 2]])
+    assert lost.value[1] == 0
+    base.place(torch.arange(3), body["qpos"], body["qvel"])
+    lost.addition(base)
+    assert lost.value[1] != 0, "a body that has got up again is worth its plan"
+
+
+def test_without_a_better_way_the_policy_goes_on_alone() -> None:
+    """Ways that shake are never worth it where acceleration costs a lot."""
+    followed = other_motion()
+    base = leaning(make_env(2))
+    planner = planner_for(2, states_of(followed), acceleration=1e3, deviation=1.0)
+    planner._plan[:, ::2] = 2.0  # and the plan so far shakes most
+    assert not whole_way(planner, base).any()
+    nothing = torch.zeros(2, planner.settings.horizon, humanoid().mj_model.nu)
+    worth, _ = simulated(base, nothing, followed, planner.settings)
+    torch.testing.assert_close(planner.value, worth.float(), rtol=0, atol=1e-4)
+
+
+def test_small_gains_change_nothing() -> None:
+    """The policy goes on alone while that is within the margin of the best way."""
+    followed = other_motion()
+    base = leaning(make_env(2))
+    free = planner_for(2, states_of(followed), margin=0.0)
+    best = whole_way(free, base)
+    assert best.abs().amax(dim=(1, 2)).min() > 0
+    nothing = torch.zeros_like(best)
+    gain = simulated(base, best, followed, free.settings)[1] - simulated(base, nothing, followed, free.settings)[1]
+    assert (gain > 0).all()
+    wide, narrow = (planner_for(2, states_of(followed), margin=float(m)) for m in (gain.max() + 1, gain.min() / 2))
+    assert not whole_way(wide, base).any()
+    torch.testing.assert_close(whole_way(narrow, base), best, rtol=0, atol=0)
+
+
+def test_only_what_balances_is_added_to_and_smoothly() -> None:
+    base = leaning(make_env(2))
+    planner = planner_for(2, states_of(true_motion()[0]), joints=["Leg"], knot=4, horizon=9, every=9, rounds=3)
+    way = whole_way(planner, base)
+    names = [joint.name for joint in humanoid().skeleton.joints for _ in joint.dofs]
+    legs = torch.tensor(["Leg" in name for name in names])
+    assert way[..., legs].any()
+    assert not way[..., ~legs].any()
+    bends = way[:, 2:] - 2 * way[:, 1:-1] + way[:, :-2]
+    at_knot = torch.tensor([step % 4 == 3 for step in range(bends.shape[1])])
+    torch.testing.assert_close(bends[:, ~at_knot], torch.zeros_like(bends[:, ~at_knot]), rtol=0, atol=1e-6)
+    assert bends[:, at_knot].abs().max() > 1e-3
+
+
+def test_planning_touches_nothing_of_the_body_it_is_for() -> None:
+    base = leaning(make_env(2))
+    planner = planner_for(2, states_of(other_motion()), rounds=2)
+    before = {name: value.clone() for name, value in base.state_dict().items()}
+    planner.addition(base)
+    after = base.state_dict()
+    assert before.keys() == after.keys()
+    assert all(torch.equal(value, after[name]) for name, value in before.items())
+
+
+def test_the_same_seed_gives_the_same_estimate_whatever_the_threads() -> None:
+    states = states_of(other_motion())
+    one, two, other = (
+        run(planner_for(2, states, env={"threads": threads}, every=4, seed=seed, rounds=2), states, actor())
+        for threads, seed in ((1, 3), (2, 3), (1, 4))
+    )
+    for a, b, c in zip(one, two, other, strict=True):
+        for name in ("qpos", "value", "confidence"):
+            np.testing.assert_array_equal(getattr(a, name), getattr(b, name))
+        assert not np.array_equal(a.qpos, c.qpos)
+
+
+def test_the_true_motion_plays_no_part() -> None:
+    true, states = true_motion()[0], states_of(other_motion())
+    altered = torch.cat([torch.cat([take[:1], take[1:].flip(0)]) for take in true.split(FRAMES)])
+    additions = []
+    for reference in (true, altered):
+        base = leaning(make_env(2, reference))
+        planner = planner_for(2, states, env={"reference": reference}, rounds=2)
+        additions.append((whole_way(planner, base), planner.value))
+    assert not torch.equal(true["qpos"], altered["qpos"])
+    for one, two in zip(*additions, strict=True):
+        assert torch.equal(one, two)
+
+
+def test_a_body_that_was_placed_elsewhere_is_planned_for_at_once() -> None:
+    followed = other_motion()
+    states, base = states_of(followed), leaning(make_env(2))
+    planner = planner_for(2, states)
+    first = planner.addition(base)
+    value = planner.value.clone()
+    moved = base.body_state()["qpos"]
+    moved[:, 9] += 0.4
+    base.place(torch.arange(2), moved, torch.zeros(2, humanoid().mj_model.nv, dtype=torch.float64))
+    planner.addition(base)
+    assert torch.equal(planner.value, value)  # the plan goes on
+    planner.forget(torch.tensor([0, 1]))
+    way = whole_way(planner, base)
+    assert not torch.equal(way[:, 0], first)
+    worth, _ = simulated(base, way, followed, planner.settings)
+    torch.testing.assert_close(planner.value, worth.float(), rtol=0, atol=1e-4)
+
+
+def test_a_restart_by_the_fail_safe_is_planned_for() -> None:
+    """The estimator tells the planner: the frame after a restart has a value of its own, between plans or not."""
+    states = states_of(true_motion()[0])
+    planner = planner_for(2, states, every=8)
+    told: list[list[int]] = []
+    forget = planner.forget
+    planner.forget = lambda worlds: (told.append(worlds.tolist()), forget(worlds))[1]  # type: ignore[method-assign]
+    guard = FailSafe(2, FailSafeSettings("naive", kappa=0.6, fallen_height=1.4))  # higher than any head here
+    estimates = estimate_takes(make_env(2), actor(), critic(), states, guard, planner=planner)
+    resets = [np.flatnonzero(one.resets) for one in estimates]
+    assert len(resets[0])
+    assert len(told) == len({int(frame) for rows in resets for frame in rows})
+    assert all(
+        one.value[frame] != one.value[frame - 1] for one, rows in zip(estimates, resets, strict=True) for frame in rows
+    )
+
+
+# --- rounds ----------------------------------------------------------------------------------------------------------
+
+
+def tries_of(planner: Planner) -> list[tuple[Tensor, Tensor]]:
+    """Ways and their scores, a round at a time, filled while the planner plans."""
+    tries: list[tuple[Tensor, Tensor]] = []
+    tried = planner._tried
+
+    def spied(now: Any, ways: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        score, worth, low = tried(now, ways)
+        tries.append((ways.clone(), score.clone()))
+        return score, worth, low
+
+    planner._tried = spied  # type: ignore[method-assign]
+    return tries
+
+
+def some_plan(planner: Planner, size: float = 0.05) -> Tensor:
+    """A plan so far that moves all that may be added to, ``[N, H, nu]``."""
+    generator = torch.Generator().manual_seed(5)
+    plan = size * torch.randn(planner._plan.shape, generator=generator) * planner._deviation.bool()
+    planner._plan.copy_(plan)
+    return plan[:, : planner.settings.horizon].clone()
+
+
+def taken(score: Tensor, ways: Tensor, chosen: PlannerSettings) -> list[int]:
+    """The way for each body by the words of the settings: none, the plan so far, or the one near the best that changes
+    least."""
+    out = []
+    for body, points in enumerate(score.T.tolist()):
+        change = [float((way[body] - ways[1, body]).square().mean()) for way in ways]
+        near = [k for k, point in enumerate(points) if point >= max(points) - chosen.near]
+        first = [k for k in (0, 1) if points[k] >= max(points) - chosen.margin]
+        out.append(first[0] if first else min(near, key=lambda k: change[k]))
+    return out
+
+
+def test_every_round_is_judged_as_a_plain_simulation_does_and_the_one_near_the_best_is_taken() -> None:
+    followed, base = other_motion(), leaning(make_env(2))
+    for near in (0.0, 0.15):
+        planner = planner_for(2, states_of(followed), samples=5, rounds=3, near=near, margin=0.0)
+        some_plan(planner, 0.3)
+        tries = tries_of(planner)
+        way = whole_way(planner, base)
+        assert [len(ways) for ways, _ in tries] == [5, 5, 5]
+        ways = torch.cat([ways for ways, _ in tries])
+        worth, score = (
+            torch.stack(values)
+            for values in zip(*(simulated(base, one, followed, planner.settings) for one in ways), strict=True)
+        )
+        torch.testing.assert_close(torch.cat([one for _, one in tries]), score.float(), rtol=0, atol=1e-4)
+        best = taken(score, ways, planner.settings)
+        assert torch.equal(way, ways[best, [0, 1]])
+        torch.testing.assert_close(planner.value, worth[best, [0, 1]].float(), rtol=0, atol=1e-4)
+        assert (score[best, [0, 1]] >= score[:5].amax(0) - near - 1e-4).all()
+        if near:
+            assert (score[best, [0, 1]] < score.amax(0) - 1e-3).any(), "or near changes nothing here"
+
+
+def test_more_rounds_from_the_same_state_and_seed_find_no_worse_way_and_some_better_ones() -> None:
+    followed, base = other_motion(), leaning(make_env(2))
+    gains = []
+    for seed in range(2):
+        found = []
+        for rounds in (1, 3):
+            planner = planner_for(2, states_of(followed), rounds=rounds, seed=seed, margin=0.0)
+            found.append(simulated(base, whole_way(planner, base), followed, planner.settings)[1])
+        gains.append(found[1] - found[0])
+    assert torch.stack(gains).min() >= -1e-4
+    assert (torch.stack(gains) > 1e-2).any(), "or there was nothing better to find"
+
+
+def test_with_all_ways_near_the_plan_so_far_is_kept_unless_none_is_within_the_margin() -> None:
+    followed, base = other_motion(), leaning(make_env(2))
+    planner = planner_for(2, states_of(followed), samples=6, rounds=3, near=1e6, margin=0.0)
+    plan, tries = some_plan(planner), tries_of(planner)
+    kept = whole_way(planner, base)
+    assert plan.any()
+    score = torch.cat([one for _, one in tries])
+    assert (score[0] < score.amax(0)).all()
+    assert (score[1] < score.amax(0)).all()
+    assert torch.equal(kept, plan)
+    wide = planner_for(2, states_of(followed), samples=6, rounds=3, near=1e6, margin=1e5)
+    some_plan(wide)
+    assert not whole_way(wide, base).any()
+
+
+@pytest.mark.parametrize(("near", "margin"), [(0.0, 0.0), (0.5, 0.0), (0.5, 0.2), (0.1, 0.3), (0.0, 0.2)])
+def test_of_any_scores_none_and_the_plan_so_far_come_first_within_the_margin(near: float, margin: float) -> None:
+    bodies, base = 40, SimpleNamespace(state_dict=dict)
+    planner = planner_for(bodies, states_of(true_motion()[0]), samples=4, rounds=3, near=near, margin=margin)
+    plan, seen, points = some_plan(planner), list[Tensor](), list[Tensor]()
+
+    def scored(now: Any, ways: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        seen.append(ways.clone())
+        points.append(torch.rand(ways.shape[:2], generator=torch.Generator().manual_seed(len(points))))
+        return points[-1], 10 + points[-1], 0 * points[-1]
+
+    planner._tried = scored  # type: ignore[method-assign]
+    planner._look_ahead(base)  # type: ignore[arg-type]
+    ways, score = torch.cat(seen), torch.cat(points)
+    assert torch.equal(ways[1], plan)
+    best, worlds = taken(score, ways, planner.settings), torch.arange(bodies)
+    assert torch.equal(planner._plan[:, : planner.settings.horizon], ways[best, worlds])
+    assert torch.equal(planner._worth, 10 + score[best, worlds])
+    # All that can be taken is: the two that come first, and ways of every round.
+    assert len({k // 4 for k in best}) == 3
+    assert {0, 1} <= set(best)
+    assert len(set(best)) > 2
+
+
+def judged(count: int, bodies: int, plan: Tensor) -> tuple[Tensor, Tensor]:
+    """Ways drawn at random, the second the plan so far, and scores of which no body's best are another's."""
+    generator = torch.Generator().manual_seed(count)
+    ways = torch.randn(count, *plan.shape, generator=generator)
+    ways[1] = plan
+    return ways, torch.stack([torch.randperm(count, generator=generator).float() for _ in range(bodies)], dim=1)
+
+
+def between(ways: Tensor, score: Tensor, body: int) -> list[Tensor]:
+    """What a later round tries of a body's ways ``[K, H, nu]`` whatever chance says, by the method's words."""
+    order = sorted(range(len(ways)), key=lambda k: -float(score[k, body]))
+    best, plan, nothing = ways[order[0], body], ways[1, body], torch.zeros_like(ways[1, body])
+    out = [other + part * (best - other) for part in (0.25, 0.5, 0.75) for other in (plan, nothing)]
+    for count in (2, 4, 8):
+        mean = ways[order[:count], body].mean(0)
+        out += [mean, 0.5 * mean, (plan + mean) / 2]
+    return out
+
+
+def holds(rows: Tensor, wanted: Tensor) -> bool:
+    return bool(((rows - wanted).abs().amax(dim=(1, 2)) < 1e-5).any())
+
+
+@pytest.mark.parametrize(("samples", "known"), [(20, 20), (20, 60), (15, 15), (9, 9), (3, 3), (3, 9)])
+def test_a_later_round_tries_what_lies_between_and_about_the_best(samples: int, known: int) -> None:
+    """Fewer samples than ways between: some of these; more: the rest, about the mean of the best four."""
+    planner = planner_for(2, states_of(true_motion()[0]), samples=samples)
+    ways, score = judged(known, 2, some_plan(planner))
+    start = planner._generator.get_state()
+    more = planner._refined(ways, score)
+    assert more.shape == (samples, *ways.shape[1:])
+    planner._generator.set_state(start)
+    drawn = planner._additions(max(samples - 15, 0))
+    for body in range(2):
+        wanted = between(ways, score, body)
+        if samples >= len(wanted):
+            assert all(holds(more[:, body], one) for one in wanted)
+        else:
+            assert all(holds(torch.stack(wanted), one) for one in more[:, body])
+        for row, addition in zip(more[15:, body], drawn[:, body], strict=True):
+            torch.testing.assert_close(row, wanted[9] + 0.5 * addition)
+    # A change of one body's scores is a change of its ways alone.
+    score[:, 1] = score[:, 1].flip(0)
+    planner._generator.set_state(start)
+    again = planner._refined(ways, score)
+    assert torch.equal(again[:, 0], more[:, 0])
+    assert not torch.equal(again[:, 1], more[:, 1])
+
+
+@pytest.mark.parametrize(
+    ("changed", "field"),
+    [
+        ({"samples": 2}, "samples"),
+        ({"rounds": 0}, "rounds"),
+        ({"rounds": 1.5}, "rounds"),
+        ({"rescue": -1}, "rescue"),
+        ({"horizon": 1}, "every"),
+        ({"every": 0}, "every"),
+        ({"knot": 0}, "knot"),
+        ({"deviation": 0.0}, "deviation"),
+        ({"lost": 0.0}, "lost"),
+        ({"sinking": 0.0}, "sinking"),
+        ({"wider": 0.0}, "wider"),
+        ({"acceleration": -1.0}, "acceleration"),
+        ({"head": -1.0}, "head"),
+        ({"margin": -1.0}, "margin"),
+        ({"near": -0.1}, "near"),
+        ({"discount": 0.0}, "discount"),
+        ({"discount": 1.1}, "discount"),
+        ({"reward": None}, "reward"),
+        ({"reward": {"kind": "world_frame"}}, "reward"),
+        ({"horizon": "far"}, "horizon"),
+        ({"speed": 3}, "speed"),
+    ],
+)
+def test_a_bad_setting_is_named(changed: dict[str, Any], field: str) -> None:
+    with pytest.raises(InputError) as refused:
+        settings(**changed)
+    assert refused.value.field == field
+
+
+def test_what_cannot_be_planned_for_is_refused() -> None:
+    states = states_of(true_motion()[0])
+    with pytest.raises(InputError, match="action") as refused:
+        planner_for(2, states, env={"kind": "torque"})
+    assert "planner=none" in str(refused.value)
+    with pytest.raises(InputError, match=r"joints.*Tail"):
+        planner_for(2, states, joints=["Tail"])
+    env = make_env(12)
+    env.append_transform(RecurrentStates({"hidden": 4}))
+    with pytest.raises(InputError, match=r"model\.memory"):
+        Planner(env, actor(), critic(), states, settings(**SMALL))
+
+
+def estimated_by(planner: PlannerSettings | None, made: Callable[[], None] = lambda: None) -> list[Estimate]:
+    """What an evaluation makes of both takes; ``made`` is called when it makes an environment."""
+
+    def env_of(split: str, *, worlds: int, threads: int, fragments: Any, **options: bool) -> TransformedEnv:
+        made()
+        assert options == {"whole_fragments": True, "falls_end": False}
+        assert list(fragments) == list(PIECES)
+        return frozen(make_env(worlds, threads=threads))
+
+    states = states_of(other_motion())
+    agent: Any = SimpleNamespace(
+        make_env=env_of,
+        material=SimpleNamespace(test=PIECES),
+        actor=actor(),
+        critic=critic(),
+        followed_states=lambda: states,
+        config={"algo": {"gamma": 0.99}},
+    )
+    failsafe = FailSafeSettings("off", kappa=0.6, fallen_height=0.3)
+    return estimate_and_judge(agent, 2, "test", failsafe, 1, None, planner)[0]
+
+
+def test_an_evaluation_plans_only_where_it_is_told_to() -> None:
+    states = states_of(other_motion())
+    for planned, by_hand in (
+        (None, run(None, states, actor())),
+        (settings(**SMALL), run(planner_for(2, states), states, actor())),
+    ):
+        for one, two in zip(estimated_by(planned), by_hand, strict=True):
+            np.testing.assert_array_equal(one.qpos, two.qpos)
+            np.testing.assert_array_equal(one.value, two.value)
+
+
+@pytest.mark.parametrize("before", [1, 2])
+def test_an_evaluation_has_the_same_threads_whatever_the_process_did_before(before: int) -> None:
+    # Last digits are other ones with other threads or another library of products, and torques that fall tell them.
+    found: list[tuple[int, str]] = []
+    usual, setting = torch.get_num_threads(), getattr(torch.backends.mkldnn, "matmul")  # noqa: B009
+    torch.set_num_threads(before)
+    try:
+        estimated_by(None, lambda: found.append((torch.get_num_threads(), setting.fp32_precision)))
+        assert torch.get_num_threads() == before
+    finally:
+        torch.set_num_threads(usual)
+    assert found == [(1, "bf16" if prefer_quick_products() else "none")]
+
+
+def test_estimates_plan_unless_they_are_causal_or_told_not_to() -> None:
+    chosen = compose_config("estimate", ["video=none", "checkpoint=none"])
+    assert allowed_planner(chosen) == settings()
+    assert allowed_planner({**chosen, "causal": True}) is None
+    assert allowed_planner({**chosen, "planner": None}) is None
+    with pytest.raises(InputError, match="samples"):  # a wrong setting is told even where it is not used
+        allowed_planner({**chosen, "causal": True, "planner": {**chosen["planner"], "samples": 0}})
+    for name, words in (("evaluate", []), ("estimate", ["video=none"])):
+        without = compose_config(name, ["checkpoint=none", "planner=none", *words])
+        assert planner_settings(without.get("planner")) is None
+
+
+# --- rescue ----------------------------------------------------------------------------------------------------------
+
+
+def sinking_tries(planner: Planner, lows: list[list[float]]) -> list[Tensor]:
+    """Ways tried, a round at a time; the best of each round is its last, better than any before, and ends that low."""
+    tried: list[Tensor] = []
+
+    def told(now: Any, ways: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        number = len(tried)
+        tried.append(ways.clone())
+        score = torch.full(ways.shape[:2], -100.0)
+        score[-1] = float(number)
+        low = torch.full(ways.shape[:2], 5.0)
+        low[-1] = torch.tensor(lows[min(number, len(lows) - 1)])
+        return score, score, low
+
+    planner._tried = told  # type: ignore[method-assign]
+    return tried
+
+
+@pytest.mark.parametrize(
+    ("lows", "rounds"),
+    [
+        ([[0.1, 0.2]], 2),  # none sinks by more than asked
+        ([[9.0, 9.0], [0.0, 0.0]], 2),  # only the best of all counts, after the usual rounds
+        ([[0.0, 0.0], [0.0, 0.21]], 5),  # one that sinks is enough, to the end
+        ([[0.0, 0.0], [0.3, 0.0], [0.0, 0.3], [0.1, 0.1]], 4),  # until none does
+    ],
+)
+def test_further_rounds_are_tried_as_long_as_a_body_sinks_in_its_best_way(lows: list[list[float]], rounds: int) -> None:
+    changes: dict[str, Any] = {"samples": 20, "rounds": 2, "rescue": 3, "sinking": 0.2, "wider": 4.0}
+    planner = planner_for(2, states_of(true_motion()[0]), **changes)
+    tried = sinking_tries(planner, lows)
+    planner._look_ahead(SimpleNamespace(state_dict=dict))  # type: ignore[arg-type]
+    assert [len(ways) for ways in tried] == [20] * rounds
+    best = tried[-1][-1]
+    assert torch.equal(planner._plan[:, : planner.settings.horizon], best)
+
+
+def test_what_is_drawn_to_rescue_is_wider_and_by_turns_anew_and_about_the_best() -> None:
+    changes: dict[str, Any] = {"samples": 40, "rounds": 1, "rescue": 2, "wider": 4.0}
+    planner = planner_for(2, states_of(true_motion()[0]), **changes)
+    tried = sinking_tries(planner, [[1.0, 1.0]])
+    planner._look_ahead(SimpleNamespace(state_dict=dict))  # type: ignore[arg-type]
+    usual, anew, about = tried
+    spread = [float(ways[2:].square().mean().sqrt()) for ways in (usual, anew)]
+    assert 3.0 < spread[1] / spread[0] < 5.0
+    # The mean of the four best is the same for all that is drawn about it; that is half as wide as what is drawn anew.
+    ways, score = torch.cat([usual, anew]), torch.full((80, 2), -100.0)
+    score[39], score[79] = 0.0, 1.0
+    fixed = planner._refined(ways, score)[:15]
+    torch.testing.assert_close(about[:6], fixed[:6])
+    size = float((about[15:] - about[15:].mean(0)).square().mean().sqrt())
+    assert 0.35 < size / spread[1] < 0.65
+
+
+def test_the_head_is_as_low_as_a_plain_simulation_ends() -> None:
+    followed, base = true_motion()[0], leaning(make_env(2))
+    planner = planner_for(2, states_of(followed))
+    ways = planner._additions(planner.settings.samples, 3.0)
+    low = planner._tried(base.state_dict(), ways)[2]
+    env = frozen(make_env(2, followed))
+    env.reset()
+    here = base_of(env)
+    here.load_state_dict(base.state_dict())
+    observation = env.transform(here.observe())
+    for step in range(planner.settings.horizon):
+        observation = actor()(observation)
+        observation["action"] = observation["action"] + ways[5, :, step]
+        observation = env.step(observation)["next"].exclude("reward", "action")
+    head, frame = humanoid().head, observation["frame"].squeeze(-1)
+    expected = (followed["xpos"][frame, head, 2] - here.body_state()["xpos"][:, head, 2]).clamp(min=0)
+    torch.testing.assert_close(low[5], expected.float(), rtol=0, atol=1e-5)
+    assert low.max() > 0.01
+    env.close()
