@@ -78,7 +78,7 @@ def read_acclaim(path: Path) -> None:
 
 
 def read_tensors(path: Path) -> None:
-    from egopose.core.safe_io import check_checkpoint_states, load_tensors
+    from egopose.core.safe_tensors import check_checkpoint_states, load_tensors
 
     meta, _, state = path.read_bytes().partition(CUT)
     component = path.parent / "checkpoint" / "components" / "0000-policy"

@@ -107,5 +107,6 @@ def test_imports_inside_functions_are_of_optional_packages() -> None:
             for node in ast.walk(function):
                 if isinstance(node, ast.ImportFrom) and node.module and node.module.split(".")[0] == "egopose":
                     inside.append(f"{module}:{node.lineno} {node.module}")
-    allowed = {line for line in inside if "." not in line.partition(":")[0]}
+    # A verb waits with its library; the viewer tells of a missing viser before it imports what needs it.
+    allowed = {line for line in inside if "." not in line.partition(":")[0] or line.startswith("viewer.session:")}
     assert not set(inside) - allowed, "\n".join(sorted(set(inside) - allowed))

@@ -27,7 +27,8 @@ from egopose.checkpoint.checkpoint import RunCheckpoint, metadata_of, read_json
 from egopose.checkpoint.checksums import CHECKSUMS, _checksums
 from egopose.core.config import check_arguments, compose_config
 from egopose.core.errors import InputError
-from egopose.core.safe_io import MAX_CHECKPOINT_BYTES, load_tensors, read_yaml
+from egopose.core.safe_io import read_yaml
+from egopose.core.safe_tensors import MAX_CHECKPOINT_BYTES, load_tensors
 from egopose.data.store import TakeInfo, TakeStore
 from egopose.motion.io import read_motion
 from egopose.motion.motion import Motion

@@ -12,7 +12,6 @@ import pytest
 import torch
 from env_stand_in import Piece, group
 
-from egopose import pipeline
 from egopose.core.errors import InputError
 from egopose.data.reference import reference_states
 from egopose.envs.mdp.observations import humanoid_state
@@ -72,7 +71,7 @@ def agent() -> Agent:
         "model": {**group("model", "fast"), "hidden": [8]},
     }
     actor, critic = build_networks(config, material, build_env(config, material, worlds=1))
-    make_env = partial(pipeline.build_env, config, material)
+    make_env = partial(build_env, config, material)
     return Agent(actor, critic, config, material, make_env, Path("run/checkpoints/1"))
 
 

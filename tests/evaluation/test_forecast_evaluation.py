@@ -16,7 +16,6 @@ import pytest
 import torch
 from env_stand_in import Piece, group
 
-from egopose import pipeline
 from egopose.core.errors import InputError
 from egopose.data.reference import reference_states
 from egopose.data.spans import Span
@@ -92,9 +91,7 @@ def agent() -> Agent:
         },
     }
     actor, critic = build_networks(config, material, build_env(config, material, worlds=1))
-    return Agent(
-        actor, critic, config, material, partial(pipeline.build_env, config, material), Path("run/checkpoints/1")
-    )
+    return Agent(actor, critic, config, material, partial(build_env, config, material), Path("run/checkpoints/1"))
 
 
 def test_everything_is_written_and_agrees(agent: Agent, tmp_path: Path) -> None:

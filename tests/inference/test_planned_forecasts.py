@@ -19,7 +19,6 @@ from test_planning import SMALL, settings
 from torch import Tensor
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from egopose import pipeline
 from egopose.core.torch_settings import torch_threads
 from egopose.data.windows import ForecastWindow
 from egopose.envs.mdp.observations import humanoid_state
@@ -31,6 +30,7 @@ from egopose.inference.forecaster import forecast
 from egopose.inference.planner import Planner, followed_futures
 from egopose.inference.planner_settings import PlannerSettings
 from egopose.pipeline.agent import Agent
+from egopose.pipeline.environment import build_env
 from egopose.pipeline.networks import build_networks
 from egopose.tasks.dataset import Material
 
@@ -60,7 +60,7 @@ def material() -> Material:
 @pytest.fixture(scope="module")
 def agent(material: Material) -> Agent:
     config = configuration()
-    make_env = partial(pipeline.build_env, config, material)
+    make_env = partial(build_env, config, material)
     env = make_env(worlds=2, fragments=PIECES[:1])
     actor, critic = build_networks(config, material, env)
     env.close()

@@ -18,7 +18,6 @@ from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 from torch import nn
 
-from egopose import pipeline
 from egopose.checkpoint.checkpoint import ComponentState, RunCheckpoint, metadata_of
 from egopose.checkpoint.package import _copy_components
 from egopose.checkpoint.run_folder import FOLDER
@@ -248,7 +247,7 @@ def test_a_forecast_follows_what_its_context_shows_and_nothing_else(material: Ma
     path = tmp_path / "checkpoints" / "checkpoint-1"
     path.mkdir(parents=True)
     actor, critic = nn.Identity(), nn.Identity()
-    agent = Agent(actor, critic, config, followed, partial(pipeline.build_env, config, followed), path)  # type: ignore[arg-type]
+    agent = Agent(actor, critic, config, followed, partial(build_env, config, followed), path)  # type: ignore[arg-type]
     states = material.states
     assert states is not None
     windows = [ForecastWindow(0, 0, 5, 12), ForecastWindow(0, 9, 5, 12)]
@@ -286,7 +285,7 @@ def test_shipped_forecasters_bring_no_curves_of_training_and_forecast_the_same(
         assert len(followed.futures.starts) == (0 if run == "shipped" else len(known.starts))
         path = tmp_path / run / "checkpoints" / "checkpoint-1"
         path.mkdir(parents=True)
-        make_env, network = partial(pipeline.build_env, config, followed), nn.Identity()
+        make_env, network = partial(build_env, config, followed), nn.Identity()
         agent = Agent(network, network, config, followed, make_env, path)  # type: ignore[arg-type]
         qpos, qvel = begin_forecasts(agent, windows, pasts)
         now = torch.tensor([windows[0].now])

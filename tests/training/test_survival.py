@@ -25,7 +25,7 @@ from egopose.benchmarks.processes import end_of, family
 from egopose.checkpoint import checkpoint as checkpoints
 from egopose.checkpoint.resume import continued_job, finished, mark_finished, only_process
 from egopose.core.errors import InputError
-from egopose.core.safe_io import load_tensors
+from egopose.core.safe_tensors import load_tensors
 from egopose.envs.transforms import VisualContext
 from egopose.training.logging import CsvCurves
 from egopose.training.loop import Run, TrainingStopped, interrupts_held, train

@@ -30,7 +30,6 @@ def run(overrides: Sequence[str], rounds: int) -> dict[str, Any]:
     Raises:
         InputError: a setting is unknown or out of range.
     """
-
     config = compose_config("train", ["sim=paper", *overrides])
     material = motion_material(config)
     settings = CollectorSettings.from_config(config["collector"])

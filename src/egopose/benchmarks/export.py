@@ -43,7 +43,6 @@ def run(overrides: Sequence[str], rounds: int) -> dict[str, Any]:
     Raises:
         InputError: an override is wrong, or a reading package is missing.
     """
-
     settings = dict(compose_config("export")["forces"])
     humanoid = humanoid_of(compose_config("train", list(overrides)))
     clip, _ = reference_motion(read_motion(_CLIP), humanoid)

@@ -42,7 +42,6 @@ def run(overrides: Sequence[str], rounds: int) -> dict[str, Any]:
     Raises:
         InputError: a setting is unknown or out of range.
     """
-
     config = compose_config("train", overrides)
     vision = config["vision"]
     size, flow_config = int(vision["video"]["size"]), FlowConfig(**vision["flow"])
@@ -81,7 +80,6 @@ def run(overrides: Sequence[str], rounds: int) -> dict[str, Any]:
 
 def write_pan(path: Path, size: int, frames: int, fps: float) -> None:
     """A video ``[frames, size, size]`` of a camera that pans and rolls over a plane of blurred noise."""
-
     generator = np.random.default_rng(0)
     noise = generator.integers(0, 256, (4 * size, 4 * size, 3), dtype=np.uint8)
     plane = cv2.normalize(cv2.GaussianBlur(noise, (0, 0), size / 40), None, 0, 255, cv2.NORM_MINMAX)  # type: ignore[call-overload]

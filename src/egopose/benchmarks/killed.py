@@ -64,7 +64,6 @@ class Notes:
 
 def train_or_go_on(config: dict[str, Any], folder: Path, number: int) -> None:
     """What the killed process does: the job of a sweep in ``folder``, from its beginning or its last checkpoint."""
-
     with folder.with_suffix(".log").open("a") as log:
         for stream in (sys.stdout, sys.stderr):
             os.dup2(log.fileno(), stream.fileno())
@@ -117,7 +116,6 @@ def loaded_otherwise(run: Any, checkpoint: Path) -> list[str]:
     What it holds is saved once more, worlds and random numbers as its workers themselves tell them, and compared file
     by file; the parameters and the normaliser's statistics of every worker with the learner's.
     """
-
     collector, differs = run.collector, []
     if isinstance(collector, Workers):
         policy, transforms = run.ppo.actor.state_dict(), transform_state(collector)
@@ -157,5 +155,4 @@ def content(checkpoint: Path) -> dict[str, bytes | dict[str, Any]]:
 
 def trainer_state(checkpoint: Path) -> dict[str, Any]:
     """A checkpoint's counters but for the clock."""
-
     return {key: value for key, value in read_json(checkpoint, "trainer_state").items() if key != "seconds"}

@@ -37,7 +37,6 @@ def run(overrides: Sequence[str], rounds: int) -> dict[str, Any]:
     Raises:
         InputError: a setting is unknown or out of range, or is for no planner.
     """
-
     ours = [word for word in overrides if word.startswith("planner.")]
     config = compose_config("train", ["sim=fast", *(word for word in overrides if word not in ours)])
     settings = planner_settings(compose_config("evaluate", ["checkpoint=none", *ours])["planner"])

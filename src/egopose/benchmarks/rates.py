@@ -34,7 +34,6 @@ def run(overrides: Sequence[str], rounds: int) -> dict[str, Any]:
     Raises:
         InputError: a setting is unknown, or the data cannot be used.
     """
-
     config = compose_config("prepare", list(overrides))
     table = HumanoidConfig.from_mapping(config["humanoid"])
     sims = [SimConfig(**{**config["sim"], "substeps": count}) for count in SUBSTEPS]

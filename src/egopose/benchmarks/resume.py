@@ -75,7 +75,6 @@ def run(overrides: Sequence[str], rounds: int) -> dict[str, Any]:
         InputError: a setting is unknown or out of range.
         RuntimeError: a training ended by itself with an error; says which.
     """
-
     if rounds < 1:
         raise InputError("bench resume", "rounds", f"must be at least 1, not {rounds}")
     # A start gets two done on average, less what its kill loses: so it does not come to its end before the last kill.
@@ -149,7 +148,6 @@ class _Campaign:
 
     def kill(self) -> None:
         """Start it, kill it at a random moment, and wait for all its processes to end."""
-
         self._notes.clear()
         others = processes.family(os.getpid())
         process = _start(self.context, self.config, self.folder, len(self.newest) - 1)

@@ -63,7 +63,6 @@ def run(overrides: Sequence[str], rounds: int) -> dict[str, Any]:
     Raises:
         InputError: a setting is unknown or out of range.
     """
-
     config = compose_config("train", ["collector=multi_sync", "collector.update_threads=1", *overrides])
     material = motion_material(config)
     settings = CollectorSettings.from_config(config["collector"])
@@ -144,7 +143,6 @@ def _times(act: Callable[[], Any], repeats: int, clock: Callable[[], float]) -> 
 
 def _collection(make_env: Callable[[int, int], EnvBase], actor: Any) -> dict[str, float]:
     """Physics, Python and policy in this process with one thread, at several batch sizes."""
-
     physics, python, policy = {}, {}, {}
     for worlds in _WORLDS:
         env = make_env(worlds, 0)
@@ -223,7 +221,6 @@ def _workers(
     count: int, settings: Any, make_env: Any, ppo: Any, file: Path, known: Mapping[str, Any], rounds: int
 ) -> dict[str, float]:
     """Memory of so many workers, what it costs to speak to them, and whole iterations where each has a core."""
-
     steps = int(known["steps_per_iteration"])
     pool = build_collector(settings, partial(make_env, settings.worlds), ppo.actor, steps)
     try:
@@ -266,7 +263,6 @@ def _whole_iterations(
 
 def _rate(name: str, collector: Any, batches: Any, ppo: Any, settings: Any, rounds: int) -> dict[str, float]:
     """Control steps/s of iterations as training takes them; ``name`` is the kind and the workers."""
-
     pids = [process.pid for process in getattr(getattr(collector, "_collector", None), "procs", ())]
     frames = 0
 

@@ -70,7 +70,6 @@ def run(overrides: Sequence[str], rounds: int) -> dict[str, Any]:
     Raises:
         InputError: a setting is unknown or out of range, the source cannot be read.
     """
-
     ours = [word.removeprefix(_PREFIX) for word in overrides if word.startswith(_PREFIX)]
     named = {word.split("=")[0] for word in ours}
     # What a command line has to say, a benchmark may leave open.
@@ -120,7 +119,6 @@ def _measured(
     values: Mapping[str, Any], trained: Trained, forecaster: Forecaster | None, progress: bool
 ) -> dict[str, Any]:
     """The last status of one stream."""
-
     source = source_settings(values, trained.config)
     loop = build_loop(values, trained, source, forecaster)
     told = 0.0
@@ -160,7 +158,6 @@ def _listen(server: str, token: str | None) -> None:
 
 def longest_take(config: Mapping[str, Any]) -> str:
     """The wearer's video of the longest take of a configuration's data, rendered where that has not been done."""
-
     store = prepare(config, progress=False, flow=False)
     longest = max(range(len(store.takes)), key=lambda i: store.takes[i].length)
     if not store.video(longest).is_file():
@@ -174,7 +171,6 @@ def untrained(config: Mapping[str, Any]) -> Trained:
     Raises:
         InputError: a setting is wrong, or the data cannot be used.
     """
-
     torch.manual_seed(0)
     states = humanoid_state(prepare(config, progress=False, flow=False).reference).float()
     return untrained_on(config, humanoid_of(config), states)
@@ -186,7 +182,6 @@ def untrained_on(config: Mapping[str, Any], humanoid: HumanoidModel, states: Ten
     Raises:
         InputError: a setting is wrong.
     """
-
     encoder = build_encoder(config["vision"]["encoder"])
     settings = from_mapping(RegressorSettings, config["regressor"], "conf/regressor")
     regressor = build_regressor(encoder, states, [Span(0, len(states))], settings, encoder.features).eval()
@@ -207,7 +202,6 @@ def untrained_forecaster(values: Mapping[str, Any], trained: Trained) -> Forecas
     Raises:
         InputError: a setting is wrong.
     """
-
     settings = forecast_settings(values)
     config = compose_config("train", ["experiment=forecasting"])
     config = {**config, **{group: trained.config[group] for group in ("sim", "humanoid")}}

@@ -27,7 +27,6 @@ def load_finder(name: str) -> LimbFinder:
     Raises:
         InputError: there is no such finder, or a file of it is damaged.
     """
-
     folder = FOLDER / name
     # A name from a stranger's configuration must not lead out of the package.
     if folder.parent != FOLDER or name in (".", "..") or not (folder / "manifest.json").is_file():

@@ -26,22 +26,15 @@ from torchrl.checkpoint import Checkpoint, CheckpointError, CheckpointRotation
 from egopose import __version__
 from egopose.checkpoint.checksums import _files, check_files, seal
 from egopose.checkpoint.pretrained import is_shipped, shipped_run
-from egopose.core import safe_io as untrusted
+from egopose.core import safe_io
 from egopose.core.errors import InputError
+from egopose.core.safe_tensors import check_checkpoint_files, check_checkpoint_states
 
 SCHEMA = 1
-
-
 FOLDER = "checkpoints"
-
-
 #: Score of a checkpoint whose weights no evaluation looked at: below any other, so that it never passes for the best.
 NOT_JUDGED = -1e300
-
-
 _PREFIX = "checkpoint-"  # of TorchRL's rotation; the control steps follow
-
-
 #: Where :func:`recover` puts a checkpoint that is not whole.
 SET_ASIDE = "damaged-"
 
@@ -170,7 +163,6 @@ def metadata_of(task: str, action_size: int, iteration: int, steps: int, score: 
 
     It is :data:`NOT_JUDGED` where these weights were not evaluated.
     """
-
     return {
         "schema": SCHEMA,
         "egopose": __version__,
@@ -191,8 +183,8 @@ def verify(path: str | Path) -> dict[str, Any]:
     folder = Path(path)
     if not (folder / "manifest.json").is_file():
         raise InputError(folder, "manifest.json", "is missing: this is no checkpoint")
-    untrusted.check_checkpoint_files(folder)
-    manifest = untrusted.read_json(folder / "manifest.json", "manifest.json")
+    check_checkpoint_files(folder)
+    manifest = safe_io.read_json(folder / "manifest.json", "manifest.json")
     try:
         metadata = dict(manifest["metadata"])
         schema = metadata["schema"]
@@ -201,7 +193,7 @@ def verify(path: str | Path) -> dict[str, Any]:
     if not isinstance(schema, int) or schema > SCHEMA:
         raise InputError(folder, "schema", f"is {schema}, this version reads up to {SCHEMA}: install a newer egopose")
     check_files(folder)
-    untrusted.check_checkpoint_states(folder)
+    check_checkpoint_states(folder)
     try:
         Checkpoint.manifest(folder)
     except CheckpointError as error:
@@ -236,8 +228,8 @@ def read_json(path: str | Path, component: str) -> Any:
     records = Checkpoint.manifest(path)["components"]
     if component not in records:
         raise InputError(path, component, "is missing in the checkpoint")
-    value = untrusted.read_json(Path(path) / records[component]["path"] / "value.json", component)
-    untrusted.check_sizes(value, Path(path))
+    value = safe_io.read_json(Path(path) / records[component]["path"] / "value.json", component)
+    safe_io.check_sizes(value, Path(path))
     return value
 
 

@@ -16,7 +16,7 @@ import hashlib
 import json
 from pathlib import Path
 
-from egopose.core import safe_io as untrusted
+from egopose.core import safe_io
 from egopose.core.errors import InputError
 
 CHECKSUMS = "checksums.json"
@@ -33,7 +33,7 @@ def check_files(folder: Path) -> None:
     Raises:
         InputError: a file is missing, added or altered.
     """
-    expected = untrusted.read_json(folder / CHECKSUMS, CHECKSUMS)
+    expected = safe_io.read_json(folder / CHECKSUMS, CHECKSUMS)
     if not isinstance(expected, dict):
         raise InputError(folder, CHECKSUMS, "cannot be read: is no object")
     found = _checksums(folder)

@@ -39,11 +39,7 @@ from egopose.core.errors import InputError
 
 #: What of a checkpoint is shipped.
 COMPONENTS = ("policy", "critic", "transforms")
-
-
 _PLACES = {"folder": None, "store": None}  # of the group data: where this machine keeps things
-
-
 #: ``describe(values, run, checkpoint, config)`` gives the contents of ``weights.json`` and ``figures.md``.
 Describe = Callable[[Mapping[str, Any], Path, Path, Mapping[str, Any]], tuple[dict[str, Any], str]]
 
@@ -62,7 +58,6 @@ def package_run(values: Mapping[str, Any], describe: Describe) -> Path:
         InputError: the run is damaged or unfinished, its configuration names a file of this machine, or a setting or
             raw result is wrong.
     """
-
     run, name = Path(str(values["run"])), str(values["name"])
     if not re.fullmatch(r"[a-z][a-z0-9_]*", name):
         raise InputError("conf/package.yaml", "name", f"must be of small letters, digits and _, not {name!r}")
@@ -123,7 +118,6 @@ def _strings(value: Any, key: str = "") -> Iterator[tuple[str, str]]:
 
 def _copy_components(source: Path, target: Path, names: Sequence[str], config: Mapping[str, Any] | None = None) -> None:
     """A checkpoint of some of another one's components, and of ``config`` where it is given."""
-
     states: dict[str, Any] = {}
 
     def component(name: str) -> ComponentState:

@@ -28,7 +28,6 @@ def shipped_run(name: str) -> Path:
     Raises:
         InputError: there is no such name, or a file is missing, added or altered.
     """
-
     wanted, there = name.removeprefix(PREFIX), shipped_names()
     if wanted not in there:
         near = difflib.get_close_matches(wanted, there, 1)

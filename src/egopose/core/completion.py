@@ -27,7 +27,6 @@ _egopose() {
 complete -o default -F _egopose egopose
 """
 
-
 _ZSH = """\
 # egopose: eval "$(egopose completion zsh)"
 _egopose() {
@@ -38,16 +37,9 @@ _egopose() {
 compdef _egopose egopose
 """
 
-
 SCRIPTS = {"bash": _BASH, "zsh": _ZSH}
-
-
 _PARSED = ("bench", "view")  # verbs with options in the manner of --port
-
-
 _CONFIG = {"bench": "train", "demo": "train"}  # verbs whose settings stand in another's file
-
-
 _MORE = {"demo": ("budget=",), "export": ("to=",)}  # words that stand in no file
 
 

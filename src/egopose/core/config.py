@@ -125,7 +125,6 @@ def compose_config(name: str, overrides: Sequence[str] = ()) -> dict[str, Any]:
 
 def explained(name: str, error: HydraException) -> InputError:
     """What Hydra says of a command line for ``conf/NAME.yaml``, in one line that says what to do."""
-
     said = str(error)
     source = f"conf/{name}.yaml"
     if key := re.search(r"Could not override '([^']+)'", said):
@@ -153,7 +152,6 @@ def check_arguments(arguments: Sequence[str]) -> None:
         InputError: ``--config-dir``, ``--config-path`` or a ``file://`` search path holds configuration that names
             something to call; a rerun from a pickle.
     """
-
     given, rest = get_args_parser().parse_known_args(list(arguments))
     if given.experimental_rerun is not None:
         raise InputError(given.experimental_rerun, "--experimental-rerun", "is a pickle, and no pickle is ever read")

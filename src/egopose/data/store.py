@@ -28,7 +28,8 @@ from torch import Tensor
 
 from egopose.core.config import convert, from_mapping
 from egopose.core.errors import InputError
-from egopose.core.safe_io import load_tensors, read_json
+from egopose.core.safe_io import read_json
+from egopose.core.safe_tensors import load_tensors
 from egopose.motion.io import read_motion, write_motion
 from egopose.motion.motion import Motion
 

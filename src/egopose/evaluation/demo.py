@@ -37,7 +37,6 @@ def run_demo(budget: str, overrides: list[str]) -> Path:
     Raises:
         InputError: an unknown budget or setting.
     """
-
     if budget not in _BUDGETS:
         raise InputError("demo", "budget", f"must be one of {', '.join(_BUDGETS)}, not {budget!r}")
     began = time.monotonic()
@@ -95,7 +94,6 @@ def show_shipped(config: Mapping[str, Any], out: Path) -> dict[str, str]:
     Returns:
         The folder of each, by name; those that do not fit the data are left out, with a line.
     """
-
     written = {}
     for name in shipped_names():
         own = read_json(find_checkpoint(f"{PREFIX}{name}"), "config")

@@ -65,7 +65,6 @@ def run_evaluation(
     Raises:
         InputError: a setting is missing or unknown, or the split holds no fragments.
     """
-
     source = "conf/evaluate.yaml"
     failsafe = from_mapping(FailSafeSettings, config["failsafe"], f"{source}: failsafe")
     contact = from_mapping(ContactSettings, config["contact"], f"{source}: contact")
@@ -126,7 +125,6 @@ def run_evaluation(
 
 def summary(results: Results) -> str:
     """What the terminal shows at the end."""
-
     lines = [tables.as_text(results.comparison, HEADLINE)]
     for run, figures in enumerate(results.survival):
         parts = ", ".join(f"{name.replace('_', ' ')} {found['frames']:.1f}" for name, found in figures.items())

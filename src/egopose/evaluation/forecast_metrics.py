@@ -18,8 +18,6 @@ from egopose.motion.rotations import Array
 
 #: Seconds, Table 3.
 HORIZONS = (1 / 3, 2 / 3, 1.0, 2.0, 3.0)
-
-
 METRICS = ("E_pose", "E_vel", "A_accl")
 
 

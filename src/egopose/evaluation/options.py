@@ -32,7 +32,6 @@ def physics_group(name: str | None) -> dict[str, Any] | None:
     Raises:
         InputError: there is no such group.
     """
-
     return None if name is None else {"sim": compose_config("prepare", [f"sim={name}"])["sim"]}
 
 
@@ -42,7 +41,6 @@ def data_at(folder: str | None, checkpoint: str, which: str) -> dict[str, Any]:
     Raises:
         InputError: None for shipped weights, which know no folder of this machine; the checkpoint cannot be read.
     """
-
     if folder is None and not weights.is_shipped(checkpoint):
         return {}
     data = read_json(find_checkpoint(checkpoint, which), "config")["data"]

@@ -17,8 +17,6 @@ from egopose.evaluation.statistics import mean_interval, ratio_interval
 
 #: Metrics of the tables, of :data:`egopose.evaluation.protocols.METRICS`; of a forecast at each of the horizons.
 SHOWN = ("E_pose", "E_vel", "A_accl", "E_key", "mpjpe_root_aligned", "root_drift", "foot_skate")
-
-
 HORIZONS = (1.0, 3.0)  # s; Yuan & Kitani 2019, table 3
 
 
@@ -26,7 +24,6 @@ def describe_run(
     values: Mapping[str, Any], run: Path, checkpoint: Path, config: Mapping[str, Any]
 ) -> tuple[dict[str, Any], str]:
     """The contents of ``weights.json`` and ``figures.md``, see :func:`egopose.checkpoint.package.package_run`."""
-
     metadata, raws = verify(checkpoint), {}
     for method, path in values["figures"].items():
         raws[str(method)] = safe_io.read_json(Path(str(path)), "figures")
@@ -57,7 +54,6 @@ def describe_run(
 
 def _figures(raw: Mapping[str, Any], interval: Mapping[str, Any], method: str) -> dict[str, Any]:
     """Mean over held-out takes of each shown metric, with its interval; resets of the fail-safe a minute."""
-
     out: dict[str, Any] = {"takes": raw["takes"]}
     for label, scores in _scores(raw, method).items():
         found = mean_interval([scores], float(interval["level"]), int(interval["draws"]), int(interval["seed"]))
@@ -76,7 +72,6 @@ def _ratios(above: Mapping[str, Any], below: Mapping[str, Any], interval: Mappin
     Raises:
         InputError: the raw results are of other takes.
     """
-
     if above["takes"] != below["takes"]:
         raise InputError("conf/package.yaml", "figures", "the raw results are of different takes")
     ours, theirs, out = _scores(above, "first"), _scores(below, "other"), {}
@@ -105,7 +100,6 @@ def _scores(raw: Mapping[str, Any], source: str) -> dict[str, list[float]]:
 
 def figures_table(about: Mapping[str, Any]) -> str:
     """The figures of ``weights.json`` as a Markdown table, methods side by side; empty where there are none."""
-
     known = {metric.key: metric for metric in METRICS}
     methods = list(about["figures"])
     if not methods:

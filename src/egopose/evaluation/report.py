@@ -14,11 +14,7 @@ from egopose.inference.outputs import RENDERED_NOTE, file_name, write_motion_fil
 from egopose.motion.io import write_motion
 
 OURS, BASELINE = "ours", "PoseReg"
-
-
 PARTLY_RENDERED_NOTE = "The wearer's video of some takes was rendered from real motion capture, not filmed."
-
-
 HEADLINE = ("E_pose", "E_vel", "A_accl", "mpjpe_root_aligned", "root_drift", "foot_skate", "contact_accuracy")
 
 

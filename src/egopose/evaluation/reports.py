@@ -26,7 +26,6 @@ _SOURCE = "conf/report.yaml"
 def evaluation_report(folder: Path, humanoid: HumanoidModel | None, overrides: Sequence[str] = ()) -> Path:
     """Write the page of an evaluation's folder: :func:`egopose.evaluation.estimation_page.write_report`'s, or of forecasts
     :func:`egopose.evaluation.forecast_page.write_forecast_page`'s."""
-
     config = compose_config("report", overrides)
     settings = from_mapping(ReportSettings, config["evaluation"], f"{_SOURCE}: evaluation")
     results = read_json(folder / "results.json", "results")
@@ -40,7 +39,6 @@ def run_report(folder: Path, overrides: Sequence[str] = ()) -> Path:
     Raises:
         InputError: it is neither an evaluation nor a sweep, or damaged; names it.
     """
-
     if not folder.is_dir():
         cause = "is a file; give the folder of an evaluation or a sweep" if folder.exists() else "no such folder"
         raise InputError(folder, "path", cause)

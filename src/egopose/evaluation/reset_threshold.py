@@ -34,7 +34,6 @@ def try_kappas(agent: Agent, kappas: Sequence[float], window: int, threads: int)
     Returns:
         A row a kappa: ``kappa``, ``E_pose`` (rad, mean over takes), and :func:`egopose.evaluation.resets.summary`.
     """
-
     humanoid, worlds = agent.material.humanoid, len(agent.material.train)
     hands = [int(dof) for dof in humanoid.hand_dofs]
     truth = torch.as_tensor(agent.material.reference["qpos"]).double().numpy()

@@ -23,8 +23,6 @@ from egopose.motion.io import WRITERS, read_motion, write_motion, writer_suffix
 from egopose.motion.motion import Motion
 
 _SOURCE = "conf/export.yaml"
-
-
 #: Endings of what cannot be written without forces, and of what holds them besides.
 _ONLY_FORCES, _HOLD_FORCES = (".forces.mot", ".torques.sto"), (".glb", ".c3d", ".csv", ".npz")
 
@@ -45,7 +43,6 @@ def run_export(source: Path, files: Sequence[str], config: Mapping[str, Any]) ->
         InputError: the source or a setting cannot be used, a file's ending is unknown, or the format cannot hold the
             motion; names it.
     """
-
     if not files:
         raise InputError("export", "to", f"says no file; endings are {', '.join(WRITERS)}")
     motions = motion_files(source, str(config["part"]), config["take"])
@@ -125,7 +122,6 @@ def _keywords(suffix: str) -> set[str]:
 
 def _with_forces(motion: Motion, source: Path, config: Mapping[str, Any], *, required: bool) -> Motion:
     """The motion with forces; as it is, and a word on standard error, where they are not required and cannot be had."""
-
     chosen = dict(config["forces"])
     enabled, choice = chosen.pop("enabled"), str(chosen.pop("humanoid"))
     settings = from_mapping(ForceSettings, chosen, f"{_SOURCE}: forces")
@@ -144,7 +140,6 @@ def humanoid_for(source: Path, choice: str) -> HumanoidModel:
     Raises:
         InputError: the evaluation's run is gone, or there is no such choice.
     """
-
     results = source / "results.json"
     if source.is_dir() and results.is_file():
         checkpoints = read_json(results, "results").get("checkpoints")

@@ -15,8 +15,6 @@ from egopose.vision.side_by_side import side_by_side
 from egopose.vision.video import iter_frames, write_video
 
 FOOTAGE = "wearer.json"
-
-
 RENDERED_NOTE = "The wearer's video was rendered from real motion capture, not filmed."
 
 

@@ -51,7 +51,6 @@ def run_estimate(config: Mapping[str, Any], agent: Agent, pose_motion: Motion, v
         InputError: a setting is missing or wrong.
         RuntimeError: no OpenGL here.
     """
-
     failsafe = from_mapping(FailSafeSettings, config["failsafe"], "conf/estimate.yaml: failsafe")
     settings = allowed_planner(config)
     guard = FailSafe(1, failsafe.for_run(agent.config, planned_kappa(settings)))
@@ -89,7 +88,6 @@ def allowed_planner(config: Mapping[str, Any]) -> PlannerSettings | None:
     Raises:
         InputError: a setting is missing or wrong.
     """
-
     settings = planner_settings(config.get("planner"))
     return None if config["causal"] else settings
 
@@ -118,7 +116,6 @@ def estimate_video(values: Mapping[str, Any]) -> Path:
         InputError: the video, the run or a setting cannot be used; names it.
         RuntimeError: no OpenGL here.
     """
-
     video = Path(str(values["video"]))
     out = video.with_name(f"{video.stem}_estimate") if values["out"] is None else Path(str(values["out"]))
     checkpoint = find_checkpoint(str(values["checkpoint"]), str(values["which"]))

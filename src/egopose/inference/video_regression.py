@@ -42,7 +42,6 @@ def causal_regression(
         task: the run's.
         lookahead: frames.
     """
-
     smoothing = float(task["action"].get("smoothing", 0.0)) / humanoid.control_dt
     joint_range = torch.as_tensor(humanoid.joint_range)
     return CausalRegression(regressor, joint_range, lookahead, _crossed(made_with), smoothing)
@@ -68,7 +67,6 @@ def seen_in(
         ``visual_features [T, D]``, ``visual_context [T, C]`` as a policy reads it, ``humanoid_state [T, S]``,
         ``joint_targets [T, nu]`` rad.
     """
-
     batch = int(made_with["vision"]["encode_batch"])
     seen = predict_span(regressor, torch.from_numpy(flow), Span(0, len(flow)), batch)
     states = seen["humanoid_state"]
@@ -84,7 +82,6 @@ def seen_live(
     causal: CausalRegression, regressor: StateRegressor, flow: np.ndarray, made_with: Mapping[str, Any]
 ) -> dict[str, Tensor]:
     """As :func:`seen_in`, each frame as it would have been seen live; smoothed where the policy follows that."""
-
     encoder, batch = regressor.encoder, int(made_with["vision"]["encode_batch"])
     features = encode(encoder, flow, batch)  # type: ignore[arg-type]  # a regressor of video has a FlowEncoder
     found = [causal.push(frame, row) for frame, row in enumerate(features)]
@@ -116,7 +113,6 @@ def video_material(humanoid: HumanoidModel, seen: Mapping[str, Tensor], name: st
     Raises:
         InputError: fewer than 2 frames.
     """
-
     frames = len(seen["humanoid_state"])
     if frames < 2:
         raise InputError(name, "video", f"has {frames} frames at 30 frames/s; at least 2 are needed")

@@ -41,8 +41,6 @@ from egopose.training.path_pose import PathPoseLearner, PathPoseSettings, build_
 from egopose.training.recurrent_baselines import RecurrentLearner, RecurrentSettings, build_forecaster
 
 KINDS = ("recurrent", "path_pose")
-
-
 RESULT = "baseline.json"
 
 

@@ -56,7 +56,6 @@ def base_clips(
     Raises:
         InputError: a file cannot be read or is of no humanoid; all are too short.
     """
-
     settings = PreparationSettings.from_mapping(preparation)
     out = {}
     for path in files:
@@ -79,7 +78,6 @@ def make_finder(values: Mapping[str, Any]) -> dict[str, Any]:
     Raises:
         InputError: a motion or a setting cannot be used, or ``out`` holds what others made.
     """
-
     out, seed = Path(str(values["out"])).expanduser(), convert(values["seed"], int, "limbs", "seed")
     pictures = PictureSettings.from_config(values["pictures"])
     training = FinderSettings.from_config(values["training"])

@@ -33,8 +33,6 @@ from egopose.training.ppo import PPO, PPOSettings
 from egopose.training.survival import frames_survived
 
 _LOOP_IN_ALGO = ("iterations", "steps_per_iteration")
-
-
 _LOOP_IN_TRAINING = ("total_steps", "max_seconds", "checkpoint_every", "keep_last", "evaluate_every")
 
 

@@ -38,7 +38,6 @@ def run_training(
         TrainingDiverged, TrainingStopped: see :func:`egopose.training.loop.train`.
         SystemExit: 130 after Ctrl-C, so that a sweep stops as well.
     """
-
     # Another Ctrl-C than the loop's own, or one before it, ends in an exception: what is on the disk stays whole.
     try:
         write_provenance(folder, config)
@@ -76,7 +75,6 @@ def run_job(config: dict[str, Any], folder: Path, material: Material | None = No
     Raises:
         InputError: as :func:`run_training`; the directory is that of another job.
     """
-
     checkpoint = continued_job(folder, config)
     if (done := finished(folder, config)) is not None:
         print(f"{folder}: {done['reason']} already after {done['iteration']} iterations", flush=True)

@@ -24,8 +24,6 @@ from egopose.envs.reference_forecasts import Futures
 from egopose.humanoid.model import HumanoidModel
 
 PROVENANCE = "provenance.json"
-
-
 #: Frames, a third of a second: the look-ahead of the causal form (conf/regressor).
 _LOOKAHEAD = 10
 

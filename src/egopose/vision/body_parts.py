@@ -20,25 +20,13 @@ from egopose.vision.video import Frame
 
 #: Side in pixels of the pictures it looks at, and of the flow (conf/vision/light.yaml's stored size).
 PICTURE, FLOW = 64, 32
-
-
 #: Classes of the masks.
 LIMBS = ("right arm", "left arm", "right leg", "left leg", "trunk")
-
-
 #: Least and largest logarithm of a variance that a finder gives.
 LOG_VARIANCE = (-4.0, 3.0)
-
-
 _FLOW_SCALE = 20.0  # as conf/vision/light.yaml: flow in widths a frame, times this, is of order one
-
-
 _SUMMARY = 256
-
-
 _BATCH = 256  # frames a forward pass
-
-
 Picture = NDArray[np.uint8]
 
 

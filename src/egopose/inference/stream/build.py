@@ -75,7 +75,6 @@ def load_trained(checkpoint: str, which: str) -> Trained:
     Raises:
         InputError: it cannot be used; names the field.
     """
-
     folder = find_checkpoint(checkpoint, which)
     config = read_json(folder, "config")
     humanoid = humanoid_of(config)
@@ -111,7 +110,6 @@ def forecast_settings(values: Mapping[str, Any]) -> ForecastSettings:
     Raises:
         InputError: a value that cannot be.
     """
-
     beside = ("checkpoint", "which", "out")
     chosen = {name: value for name, value in values["forecast"].items() if name not in beside}
     return from_mapping(ForecastSettings, chosen, f"{_CONFIG}: forecast")
@@ -123,7 +121,6 @@ def load_forecaster(values: Mapping[str, Any], trained: Trained) -> Forecaster |
     Raises:
         InputError: it cannot be used, or is of another body or another flow than the estimating run's.
     """
-
     settings, checkpoint = forecast_settings(values), values["forecast"]["checkpoint"]
     if checkpoint is None:
         return None
@@ -161,7 +158,6 @@ def still_frames(
     humanoid: HumanoidModel, regressor: StateRegressor, made_with: Mapping[str, Any], frames: int = 2
 ) -> Material:
     """The material of a take of still frames: what an environment needs to be made before anything is seen."""
-
     size = int(made_with["vision"]["flow"]["stored_size"])
     still = np.zeros((frames, planes_of(made_with["regressor"]), size, size), np.float16)
     return video_material(humanoid, seen_in(humanoid, regressor, still, made_with), "stream")[0]
@@ -175,7 +171,6 @@ def build_loop(
     Raises:
         InputError: a setting is wrong.
     """
-
     for name, least in (("threads", 1), ("opencv_threads", 1), ("lookahead", 0), ("bridge", 0), ("latency_frames", 1)):
         if not isinstance(values[name], int) or values[name] < least:
             raise InputError(_CONFIG, name, f"must be a whole number of at least {least}, not {values[name]!r}")
@@ -205,7 +200,6 @@ def build_loop(
 
 def _forecasts(values: Mapping[str, Any], forecaster: Forecaster, fallen_height: float, rate: float) -> ForecastThread:
     """The thread, not yet begun, whose parts have done their work once."""
-
     settings = forecaster.settings
     every = max(round(settings.every * rate), 1)
     capacity = max(values["latency_frames"] // every, 1)
@@ -223,7 +217,6 @@ def _forecasts(values: Mapping[str, Any], forecaster: Forecaster, fallen_height:
 
 def warm_up(sight: Sight, regression: CausalRegression, body: LiveBody) -> None:
     """Let all parts do their work on a still picture: the first time takes a hundred times as long."""
-
     still = np.zeros((64, 64, 3), np.uint8)
     poses = frame = 0
     while poses < 3:
@@ -240,7 +233,6 @@ def source_settings(values: Mapping[str, Any], config: Mapping[str, Any] | None 
     Raises:
         InputError: no such take or file, a file that is no video, an address of an unknown kind.
     """
-
     given = {name: values[name] for name in ("pace", "repeat", "offset")}
     given["reconnect"] = from_mapping(ReconnectSettings, values["reconnect"], f"{_CONFIG}: reconnect")
     given["fps"] = Camera.from_mapping(values["camera"], "camera").fps
@@ -260,7 +252,6 @@ def take_video(config: Mapping[str, Any], name: str) -> tuple[Path, float]:
     Raises:
         InputError: the store is not prepared or has no such take; names what there is.
     """
-
     store = TakeStore.open(store_folder(config))
     names = [take.name for take in store.takes]
     if name not in names:
@@ -278,7 +269,6 @@ def stream(values: Mapping[str, Any], stop: threading.Event | None = None) -> di
     Raises:
         InputError: source, run or setting cannot be used; names it.
     """
-
     check_outputs(values)
     source_settings(values)
     trained = load_trained(str(values["checkpoint"]), str(values["which"]))
