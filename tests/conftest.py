@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from egopose.core.torch_settings import prefer_quick_products
+from egopose.core.torch_settings import enable_onednn_matmul
 
 SHARED = Path(__file__).resolve().parents[1].parent / "shared"
 
@@ -15,7 +15,7 @@ SHARED = Path(__file__).resolve().parents[1].parent / "shared"
 @pytest.fixture(scope="session", autouse=True)
 def one_way_of_multiplying() -> None:
     """Training chooses it for the process: results to the bit must not depend on the tests that ran before."""
-    prefer_quick_products()
+    enable_onednn_matmul()
 
 
 @pytest.fixture(scope="session")

@@ -47,7 +47,7 @@ LOOP: dict[str, Any] = {
 }
 COLLECTOR: dict[str, Any] = {
     "kind": "sync",
-    "worlds": 8,
+    "num_envs": 8,
     "physics_threads": 1,
     "workers": 1,
     "threads": 1,
@@ -59,25 +59,25 @@ CONFIG: dict[str, Any] = {"task": {"name": "toy"}, "seed": 3}
 class ToyEnv(EnvBase):
     """``humanoid_state [4]`` is moved by ``action [2]``; too far from the origin is a fall, 20 steps the time limit."""
 
-    def __init__(self, worlds: int = 8, size: int = 2, seed: int = 0) -> None:
-        super().__init__(device=None, batch_size=torch.Size([worlds]))
+    def __init__(self, num_envs: int = 8, size: int = 2, seed: int = 0) -> None:
+        super().__init__(device=None, batch_size=torch.Size([num_envs]))
         self.size = size
-        n = (worlds,)
-        flag = Binary(1, (worlds, 1), dtype=torch.bool)
+        n = (num_envs,)
+        flag = Binary(1, (num_envs, 1), dtype=torch.bool)
         self.observation_spec = Composite(
-            humanoid_state=Unbounded((worlds, 2 * size)),
-            visual_context=Unbounded((worlds, 3)),
-            episode_step=Unbounded((worlds, 1), dtype=torch.int64),
-            reward_terms=Composite(pose=Unbounded((worlds, 1)), root_pose=Unbounded((worlds, 1)), shape=n),
+            humanoid_state=Unbounded((num_envs, 2 * size)),
+            visual_context=Unbounded((num_envs, 3)),
+            episode_step=Unbounded((num_envs, 1), dtype=torch.int64),
+            reward_terms=Composite(pose=Unbounded((num_envs, 1)), root_pose=Unbounded((num_envs, 1)), shape=n),
             diverged=flag.clone(),
             shape=n,
         )
-        self.action_spec = Unbounded((worlds, size))
-        self.reward_spec = Unbounded((worlds, 1))
+        self.action_spec = Unbounded((num_envs, size))
+        self.reward_spec = Unbounded((num_envs, 1))
         self.done_spec = Composite({k: flag.clone() for k in ("done", "terminated", "truncated")}, shape=n)
         self.generator = torch.Generator().manual_seed(seed)
-        self.x = torch.zeros(worlds, 2 * size)
-        self.t = torch.zeros(worlds, dtype=torch.int64)
+        self.x = torch.zeros(num_envs, 2 * size)
+        self.t = torch.zeros(num_envs, dtype=torch.int64)
 
     def _set_seed(self, seed: int | None) -> None:
         self.generator.manual_seed(seed or 0)
@@ -131,14 +131,14 @@ class ToyEnv(EnvBase):
         self.generator.set_state(state_dict["generator"])
 
 
-def make_env(worlds: int = 8, size: int = 2) -> TransformedEnv:
+def make_env(num_envs: int = 8, size: int = 2) -> TransformedEnv:
     """The toy under a transform with a state of its own."""
-    return TransformedEnv(ToyEnv(worlds, size), StepCounter())
+    return TransformedEnv(ToyEnv(num_envs, size), StepCounter())
 
 
-def toy_worker(worlds: int, size: int, worker: int) -> TransformedEnv:
+def toy_worker(num_envs: int, size: int, worker: int) -> TransformedEnv:
     """The toy of one worker, at module level for other processes."""
-    return TransformedEnv(ToyEnv(worlds, size, seed=worker), StepCounter())
+    return TransformedEnv(ToyEnv(num_envs, size, seed=worker), StepCounter())
 
 
 class _Gaussian(nn.Module):
@@ -164,7 +164,7 @@ def networks(size: int = 2) -> tuple[ProbabilisticActor, ValueOperator]:
     return actor, ValueOperator(MLP(2 * size + 3, 1, num_cells=[16]), in_keys=keys)
 
 
-def make_run(folder: Path, size: int = 2, worlds: int = 8, seed: int = 3, **settings: Any) -> Run:
+def make_run(folder: Path, size: int = 2, num_envs: int = 8, seed: int = 3, **settings: Any) -> Run:
     """A run on the toy; ``settings`` override :data:`SETTINGS` and :data:`LOOP` by name."""
     torch.manual_seed(seed)
     loop = {k: settings.pop(k, v) for k, v in LOOP.items()}
@@ -173,6 +173,6 @@ def make_run(folder: Path, size: int = 2, worlds: int = 8, seed: int = 3, **sett
     collector_settings = CollectorSettings.from_config({**COLLECTOR, **settings.pop("collector", {})})
     ppo = PPO(actor, critic, PPOSettings.from_config({**SETTINGS, **settings}))
     collector = build_collector(
-        collector_settings, partial(toy_worker, worlds, size), actor, loop["steps_per_iteration"]
+        collector_settings, partial(toy_worker, num_envs, size), actor, loop["steps_per_iteration"]
     )
     return Run(ppo, collector, LoopSettings.from_config(loop), collector_settings, folder, config, action_size=size)

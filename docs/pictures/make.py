@@ -24,7 +24,7 @@ from egopose.humanoid.model import HumanoidModel
 from egopose.humanoid.physics import BatchedPhysics
 from egopose.motion.io import read_motion
 from egopose.motion.motion import Motion
-from egopose.vision.camera_rotation import camera_turning
+from egopose.vision.camera_rotation import camera_rotation
 from egopose.vision.flow import FlowConfig, flow_image, flow_of_frames
 from egopose.vision.rendering import SceneRenderer, wearer_frames
 from egopose.vision.rooms import room_seed
@@ -93,7 +93,7 @@ def seen(humanoid: HumanoidModel, clip: Motion) -> None:
 def turning(humanoid: HumanoidModel, clip: Motion) -> None:
     """How fast head and camera turn."""
     _, flow = filmed(humanoid, clip, 128)
-    head, camera = head_turning(clip, 30.0), 30.0 * camera_turning(flow[1:], 102.5)
+    head, camera = head_turning(clip, 30.0), 30.0 * camera_rotation(flow[1:], 102.5)
     figure, axis = plt.subplots(figsize=(7.5, 2.8))
     for turns, label in ((head, "head, from the motion"), (camera, "camera, from optical flow")):
         axis.plot((np.arange(len(turns)) + 0.5) / 30, np.linalg.norm(turns, axis=1), label=label)

@@ -23,7 +23,7 @@ RAW = HERE / "raw"
 #: Yuan & Kitani 2019, table 1, single subject: ours, PoseReg.
 PAPER = {"E_pose": (0.640, 0.833), "E_vel": (4.469, 5.450), "A_accl": (5.002, 7.733)}
 COMMANDS = """python -m egopose.train experiment=first_estimation data.folder=PATH/cmu_bvh60 output=runs/first
-python -m egopose.evaluate checkpoint=runs/first/RUN which=latest failsafe.kappa=0.3
+python -m egopose.evaluate checkpoint=runs/first/RUN which=latest failsafe.reset_threshold=0.3
 python experiments/first_estimation/table.py --run runs/first/RUN"""
 
 
@@ -107,7 +107,7 @@ def main() -> None:
         *ratio_table(results),
         "",
         "Frames survived from random starts on the test fragments: "
-        + ", ".join(f"{name.replace('_', ' ')} {found['frames']:.1f}" for name, found in survival.items())
+        + ", ".join(f"{name.replace('_', ' ')} {result['frames']:.1f}" for name, result in survival.items())
         + ".",
         "",
         "![curves](curves.png)",

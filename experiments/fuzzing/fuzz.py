@@ -56,7 +56,7 @@ def child(name: str, runs: int, seed: int, work: Path) -> None:
 
     def one(data: bytes) -> None:
         path.write_bytes(data)
-        start, found = time.process_time(), None
+        start, result = time.process_time(), None
         try:
             reader.read(path)
             counts["read"] += 1
@@ -64,20 +64,20 @@ def child(name: str, runs: int, seed: int, work: Path) -> None:
         except InputError as error:
             counts["refused"] += 1
             if len(str(error)) > 400 or "\n" in str(error):
-                found = ("message", f"not one short line: {str(error)[:100]!r}")
+                result = ("message", f"not one short line: {str(error)[:100]!r}")
         except BaseException as error:
             place = traceback.extract_tb(error.__traceback__)[-1]
-            found = (f"{type(error).__name__} {Path(place.filename).name}:{place.lineno}", str(error)[:200])
+            result = (f"{type(error).__name__} {Path(place.filename).name}:{place.lineno}", str(error)[:200])
         seconds = time.process_time() - start
         counts["inputs"] += 1
         counts["slowest_s"] = max(counts["slowest_s"], seconds)
-        if found is None and seconds > SLOW_SECONDS:
-            found = ("slow", f"{seconds:.1f} s")
-        if found is not None and found[0] not in findings:
+        if result is None and seconds > SLOW_SECONDS:
+            result = ("slow", f"{seconds:.1f} s")
+        if result is not None and result[0] not in findings:
             digest = hashlib.sha256(data).hexdigest()[:12]
             (HERE / "findings" / f"{name}-{digest}{reader.suffix}").write_bytes(data)
-            findings[found[0]] = {"what": found[1], "file": f"{name}-{digest}{reader.suffix}"}
-        if counts["inputs"] % 100 == 0 or found is not None:
+            findings[result[0]] = {"what": result[1], "file": f"{name}-{digest}{reader.suffix}"}
+        if counts["inputs"] % 100 == 0 or result is not None:
             (work / "counts.json").write_text(json.dumps({**counts, "findings": findings}))
 
     def mutator(data: bytes, limit: int, number: int) -> bytes:

@@ -32,7 +32,7 @@ from egopose.models.mirror import state_mirror
 from egopose.models.regressor import state_statistics
 from egopose.motion.rotations import Array
 from egopose.pipeline.dataset import absolute_paths
-from egopose.pipeline.regressor_input import load_finder_of, seen_in_store
+from egopose.pipeline.regressor_input import load_body_part_estimator_of, seen_in_store
 from egopose.training.blended_regressor import (
     KernelSettings,
     fit_kernels,
@@ -42,7 +42,7 @@ from egopose.training.blended_regressor import (
     windowed,
 )
 from egopose.vision.body_part_pictures import BODIES, posture_in
-from egopose.vision.body_parts import LOG_VARIANCE, LimbFinder
+from egopose.vision.body_parts import LOG_VARIANCE, BodyPartEstimator
 from egopose.vision.rendering import WEARER_CAMERA, camera_orientations, worn_camera
 from egopose.vision.takes import RenderConfig, take_seed
 
@@ -96,7 +96,7 @@ def with_truth(rows: Tensor, truth: Tensor, known: Tensor) -> Tensor:
     return torch.cat([torch.where(known, truth, posture), log_variance.masked_fill(known, LOG_VARIANCE[0])], dim=1)
 
 
-def told(rows: Tensor, postures: Tensor, inside: Tensor, finder: LimbFinder) -> dict[str, Tensor]:
+def told(rows: Tensor, postures: Tensor, inside: Tensor, finder: BodyPartEstimator) -> dict[str, Tensor]:
     """What the kernels are given beside flow, by what is said of it in the table."""
     truth = (postures - finder.mean) / finder.std
     nothing = torch.zeros_like(truth, dtype=torch.bool)
@@ -165,7 +165,7 @@ def main() -> None:
     words = ["data=cmu6", "regressor=blended", *parser.parse_args().overrides]
     config = absolute_paths(compose_config("train", words))
     regressor = config["regressor"]
-    store, humanoid, finder = prepare(config), humanoid_of(config), load_finder_of(regressor)
+    store, humanoid, finder = prepare(config), humanoid_of(config), load_body_part_estimator_of(regressor)
     assert finder is not None
     takes = [Span(t.offset, t.offset + t.length) for t in store.takes]
     settings = from_mapping(KernelSettings, regressor["kernel"], "conf/regressor kernel")

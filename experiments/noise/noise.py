@@ -32,7 +32,7 @@ from egopose.inference.planner_settings import planner_settings
 from egopose.models.baselines.path_pose import PathPose
 from egopose.pipeline.agent import load_agent
 from egopose.pipeline.baselines import load_baseline, path_pose_motion
-from egopose.pipeline.dataset import run_material
+from egopose.pipeline.dataset import run_dataset
 from egopose.vision.corruption import Corruption
 
 HERE = Path(__file__).resolve().parent
@@ -74,26 +74,24 @@ def judge(run: Path, config: Mapping[str, Any], corruption: Mapping[str, Any]) -
     # Not the best: which that is, is decided on test fragments while training.
     overrides = {"corruption": corruption, "vision": config["vision"]}
     agent = load_agent(run, which="latest", overrides=overrides)
-    fragments = list(agent.material.test)
+    fragments = list(agent.dataset.test)
     labels = _labels(agent.config, fragments)
     failsafe = from_mapping(FailSafeSettings, settings["failsafe"], "conf/evaluate.yaml: failsafe")
     planner, threads = planner_settings(planner_of(config)), int(settings["threads"])
-    found = evaluate_agent(agent, fragments, labels, "test", failsafe, contact, threads, planner=planner)
+    result = evaluate_agent(agent, fragments, labels, "test", failsafe, contact, threads, planner=planner)
     return {
-        method_of(config): raw_figures([one.scores for one in found]),
-        regressor_of(agent.config): raw_figures([one.pose_regression_scores for one in found]),
+        method_of(config): raw_figures([one.scores for one in result]),
+        regressor_of(agent.config): raw_figures([one.pose_regression_scores for one in result]),
     }
 
 
 def _path_pose(run: Path, config: Mapping[str, Any], contact: ContactSettings) -> Result:
-    material, model = run_material(config, run), load_baseline(run).model
+    dataset, model = run_dataset(config, run), load_baseline(run).model
     assert isinstance(model, PathPose)
     flow = TakeStore.open(store_folder(config)).flow(flow_name(config))
-    labels = _labels(config, material.test)
-    motions = [
-        path_pose_motion(model, flow, material, f, label) for f, label in zip(material.test, labels, strict=True)
-    ]
-    return raw_figures(score_motions(motions, material.test, material, contact))
+    labels = _labels(config, dataset.test)
+    motions = [path_pose_motion(model, flow, dataset, f, label) for f, label in zip(dataset.test, labels, strict=True)]
+    return raw_figures(score_motions(motions, dataset.test, dataset, contact))
 
 
 def _labels(config: Mapping[str, Any], fragments: Sequence[Any]) -> list[str]:
@@ -125,22 +123,22 @@ def judge_all(runs: Sequence[Path], corruptions: Sequence[str], results: Path, w
             if all(_is_done(place, corruption, planner, run) for place in places.values()):
                 continue
             print(f"{method}: {run} on {name}", flush=True)
-            for one, found in judge(run, config, corruption).items():
+            for one, result in judge(run, config, corruption).items():
                 about = {"method": one, "fold": fold, "trained": trained, "seed": config["seed"], "corruption": name}
                 place = places[one]
                 place.parent.mkdir(parents=True, exist_ok=True)
                 part = place.with_suffix(".part")
                 write_json(
-                    part, {**about, "settings": corruption, "planner": planner, "run": run.resolve().name, **found}
+                    part, {**about, "settings": corruption, "planner": planner, "run": run.resolve().name, **result}
                 )
                 os.replace(part, place)
 
 
 def _is_done(place: Path, corruption: Mapping[str, Any], planner: Any, run: Path) -> bool:
     try:
-        found = json.loads(place.read_text())
-        same = found["settings"] == corruption and found.get("planner") == planner
-        return bool(same and found["run"] == run.resolve().name)
+        result = json.loads(place.read_text())
+        same = result["settings"] == corruption and result.get("planner") == planner
+        return bool(same and result["run"] == run.resolve().name)
     except (OSError, ValueError, KeyError, TypeError):
         return False
 

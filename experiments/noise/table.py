@@ -57,7 +57,7 @@ def gather(results: Path) -> dict[tuple[str, str, str], Row]:
     Raises:
         InputError: a file is damaged, or the takes of a fold differ.
     """
-    found: dict[tuple[str, str, str], dict[str, list[Mapping[str, Any]]]] = defaultdict(lambda: defaultdict(list))
+    result: dict[tuple[str, str, str], dict[str, list[Mapping[str, Any]]]] = defaultdict(lambda: defaultdict(list))
     takes: dict[str, list[str]] = {}
     for path in sorted((results / "raw").glob("*.json")):
         raw = read_json(path, "raw result")
@@ -65,10 +65,10 @@ def gather(results: Path) -> dict[tuple[str, str, str], Row]:
             fold, key = raw["fold"], (raw["fold"], raw["method"], raw["trained"])
             if takes.setdefault(fold, raw["takes"]) != raw["takes"]:
                 raise InputError(path, "takes", "differ from those of other methods of this fold")
-            found[key][raw["corruption"]].append(raw)
+            result[key][raw["corruption"]].append(raw)
         except (KeyError, TypeError) as error:
             raise InputError(path, "raw result", f"is damaged: {error!r}") from None
-    return {key: {name: sorted(raws, key=_seed) for name, raws in row.items()} for key, row in found.items()}
+    return {key: {name: sorted(raws, key=_seed) for name, raws in row.items()} for key, row in result.items()}
 
 
 def _seed(raw: Mapping[str, Any]) -> int:
@@ -129,10 +129,10 @@ def write_table(results: Path) -> Path:
     Raises:
         InputError: there is nothing to make it of, or a raw result is damaged.
     """
-    found = gather(results)
-    if not found:
+    result = gather(results)
+    if not result:
         raise InputError(results, "raw", "holds no results: run noise.py first")
-    settings = {name: raws[0]["settings"] for row in found.values() for name, raws in row.items()}
+    settings = {name: raws[0]["settings"] for row in result.values() for name, raws in row.items()}
     lines = [
         "# Corrupted video",
         "",
@@ -152,8 +152,8 @@ def write_table(results: Path) -> Path:
         *(_line([CORRUPTIONS[name], _said(settings[name])]) for name in CORRUPTIONS if name in settings),
         "",
     ]
-    for fold in sorted({key[0] for key in found}):
-        rows = {key[1:]: row for key, row in found.items() if key[0] == fold}
+    for fold in sorted({key[0] for key in result}):
+        rows = {key[1:]: row for key, row in result.items() if key[0] == fold}
         one = next(iter(next(iter(rows.values())).values()))[0]
         lines += [f"## {fold}: {len(one['takes'])} takes, {sum(one['frames']) / 30:.0f} s", "", *fold_tables(rows)]
     findings = results / "findings.md"

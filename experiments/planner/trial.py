@@ -100,17 +100,17 @@ def main() -> None:
     parser.add_argument("--only", default="*")
     given = parser.parse_args()
     agent = load_agent(given.run, which="latest")
-    fragments = drawn(agent.material.train, given.frames, given.seed)
-    agent = replace(agent, material=replace(agent.material, train=fragments))
+    fragments = drawn(agent.dataset.train, given.frames, given.seed)
+    agent = replace(agent, dataset=replace(agent.dataset, train=fragments))
     for name, changes in read_yaml(HERE / "trial.yaml", "rows").items():
         if raw(name).is_file() or not fnmatch.fnmatch(name, given.only):
             continue
-        found = figures(row(agent, fragments, changes))
+        result = figures(row(agent, fragments, changes))
         raw(name).parent.mkdir(exist_ok=True)
         write_text_whole(
-            raw(name), json.dumps({"settings": changes, "run": given.run.name, "seed": given.seed, **found}, indent=1)
+            raw(name), json.dumps({"settings": changes, "run": given.run.name, "seed": given.seed, **result}, indent=1)
         )
-        print(name, found, flush=True)
+        print(name, result, flush=True)
     write_table()
 
 

@@ -29,36 +29,36 @@ CORES = (1, 2, 4, 8, 16, 32, 64, 128, 256, 512, 1024)
 
 @dataclass(frozen=True)
 class Plan:
-    """How an iteration is divided: ``workers`` with ``worlds`` each take ``steps`` batched steps."""
+    """How an iteration is divided: ``workers`` with ``num_envs`` each take ``steps`` batched steps."""
 
     workers: int
-    worlds: int
+    num_envs: int
     steps: int
 
     @property
     def frames(self) -> int:
-        return self.workers * self.worlds * self.steps
+        return self.workers * self.num_envs * self.steps
 
 
 def same_batch(cost: dict[str, Any], workers: int) -> Plan:
     """The configuration's own batch, however many workers share it, as long as pieces keep a useful length."""
     frames = cost["steps_per_iteration"]
-    worlds = max(1, min(cost["worlds"], frames // (workers * SHORTEST)))
+    worlds = max(1, min(cost["num_envs"], frames // (workers * SHORTEST)))
     return Plan(workers, worlds, max(SHORTEST, round(frames / (workers * worlds))))
 
 
 def growing_batch(cost: dict[str, Any], workers: int) -> Plan:
     """Every worker's worlds and 128 steps of each: the batch grows with the workers."""
-    return Plan(workers, cost["worlds"], 128)
+    return Plan(workers, cost["num_envs"], 128)
 
 
 def collect_seconds(cost: dict[str, Any], plan: Plan, rng: np.random.Generator, size: int) -> np.ndarray:
     """``[size]`` seconds that workers take for a piece. Steps of more worlds spread less, as sums do."""
-    n = plan.worlds
+    n = plan.num_envs
     step = cost["python_fixed_s"] + cost["policy_fixed_s"]
     step += n * (cost["physics_s"] + cost["python_world_s"] + cost["policy_world_s"])
     spread = cost["physics_cv"] * cost["physics_s"] * n * np.sqrt(32 / n * plan.steps)
-    pack = plan.worlds * plan.steps * cost["pack_s"] if plan.workers > MACHINE else 0.0
+    pack = plan.num_envs * plan.steps * cost["pack_s"] if plan.workers > MACHINE else 0.0
     return np.maximum(plan.steps * step + pack + spread * rng.standard_normal(size), 0.0)
 
 
@@ -155,7 +155,7 @@ def table(cost: dict[str, Any]) -> str:
         for cores, plan, rate, shares in points:
             if cores in (1, 2, 16, 64, 1024):
                 parts = " | ".join(f"{shares[part]:.0%}" for part in ("collect", "transfer", "update"))
-                size = f"{plan.worlds} x {plan.steps} | {plan.frames:,}"
+                size = f"{plan.num_envs} x {plan.steps} | {plan.frames:,}"
                 lines.append(f"| {cores} | {name} | {size} | {rate:,.0f} | {parts} |")
     return "\n".join(lines) + "\n"
 
@@ -163,8 +163,8 @@ def table(cost: dict[str, Any]) -> str:
 def plot(cost: dict[str, Any], path: Path) -> None:
     """Steps/s over cores, each way of dividing the work a line."""
     figure, axes = plt.subplots(figsize=(7, 4.5))
-    found = curves(cost)
-    for name, points in found.items():
+    result = curves(cost)
+    for name, points in result.items():
         axes.plot([p[0] for p in points], [p[2] for p in points], marker=".", label=name)
     one = in_step(cost, growing_batch(cost, 1))[0]
     axes.plot(CORES, [one * cores for cores in CORES], "k:", label="as many times one core")

@@ -43,18 +43,18 @@ def gather(folder: Path) -> dict[tuple[int, str], Mapping[str, Any]]:
     Raises:
         InputError: a file is damaged.
     """
-    found: dict[tuple[int, str], Mapping[str, Any]] = {}
+    result: dict[tuple[int, str], Mapping[str, Any]] = {}
     for path in sorted((folder / "raw").glob("*.json")):
         raw = read_json(path, "raw result")
         try:
             budget = int(raw["overrides"][_budget_at(raw["overrides"])].split("=")[1])
             key = (budget, str(raw["method"]))
             raw["survival"]["policy"], raw["takes"], raw["figures"], raw["resets"]
-            if key not in found or int(raw["seed"]) < int(found[key]["seed"]):
-                found[key] = raw
+            if key not in result or int(raw["seed"]) < int(result[key]["seed"]):
+                result[key] = raw
         except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
             raise InputError(path, "raw result", f"is damaged: {error!r}") from None
-    return found
+    return result
 
 
 def _budget_at(overrides: Sequence[str]) -> int:

@@ -33,11 +33,11 @@ from egopose.models.baselines.recurrent import RecurrentForecaster
 from egopose.motion.rotations import Array
 from egopose.pipeline.agent import Agent, load_agent
 from egopose.pipeline.baselines import forecast_qpos, load_baseline, path_pose_motion, regressed_motion
-from egopose.pipeline.dataset import absolute_paths, load_material, run_material
+from egopose.pipeline.dataset import absolute_paths, load_dataset, run_dataset
 from egopose.pipeline.regressor import load_regressor
 from egopose.pipeline.regressor_input import seen_in_store
 from egopose.pipeline.training import run_job as train_job
-from egopose.tasks.dataset import Material
+from egopose.tasks.dataset import Dataset
 from egopose.training.logging import write_provenance
 from egopose.training.survival import base_tracking, frames_survived, reference_tracking
 
@@ -67,9 +67,9 @@ def run_job(job: Job, runs: Path, results: Path, machine: Sequence[str]) -> None
         run_baseline_job(config, folder)
     else:
         write_provenance(folder, config)
-        material = load_material(config)
-        material.keep_regressor(folder)
-        material.keep_provenance(folder)
+        dataset = load_dataset(config)
+        dataset.keep_regressor(folder)
+        dataset.keep_provenance(folder)
     judged = config
     if job.evaluate:
         judged = _config(name, [*job.overrides, *job.evaluate, *machine], job.evaluate_store, runs)
@@ -100,8 +100,8 @@ def _training(folder: Path) -> Result | None:
     return json.loads(path.read_text()) if path.is_file() else None
 
 
-def _material(folder: Path, config: dict[str, Any], judged: dict[str, Any]) -> Material:
-    return run_material(judged, folder, same_store=judged is config)
+def _material(folder: Path, config: dict[str, Any], judged: dict[str, Any]) -> Dataset:
+    return run_dataset(judged, folder, same_store=judged is config)
 
 
 def _labels(config: dict[str, Any], fragments: Sequence[Any]) -> list[str]:
@@ -117,29 +117,27 @@ def _estimates(
         other = {} if judged is config else {key: judged[key] for key in ("data", "vision")}
         # Not the best: which that is, is decided on test fragments while training.
         agent = load_agent(folder, which="latest", overrides=other)
-        fragments = list(agent.material.test)
+        fragments = list(agent.dataset.test)
         labels = _labels(judged, fragments)
         failsafe = from_mapping(FailSafeSettings, settings["failsafe"], "conf/evaluate.yaml: failsafe")
         planner = planner_settings(settings.get("planner"))
         threads = int(settings["threads"])
-        found = evaluate_agent(agent, fragments, labels, "test", failsafe, contact, threads, planner=planner)
-        diverged = sum(one.estimate.diverged for one in found)
+        result = evaluate_agent(agent, fragments, labels, "test", failsafe, contact, threads, planner=planner)
+        diverged = sum(one.estimate.diverged for one in result)
         survival = {"survival": _survival(agent, settings)} if job.survival else {}
-        fallen = [int(one.estimate.fallen.sum()) for one in found]
-        return raw_figures([one.scores for one in found]) | {"diverged": int(diverged), "fallen": fallen} | survival
-    material = _material(folder, config, judged)
-    fragments = list(material.test)
+        fallen = [int(one.estimate.fallen.sum()) for one in result]
+        return raw_figures([one.scores for one in result]) | {"diverged": int(diverged), "fallen": fallen} | survival
+    dataset = _material(folder, config, judged)
+    fragments = list(dataset.test)
     labels = _labels(judged, fragments)
     if job.verb == "regressor":
-        motions = [regressed_motion(material, f, label) for f, label in zip(fragments, labels, strict=True)]
+        motions = [regressed_motion(dataset, f, label) for f, label in zip(fragments, labels, strict=True)]
     else:
         model = load_baseline(folder).model
         assert isinstance(model, PathPose), f"{job.method} estimates nothing"
         flow = TakeStore.open(store_folder(judged)).flow(flow_name(judged))
-        motions = [
-            path_pose_motion(model, flow, material, f, label) for f, label in zip(fragments, labels, strict=True)
-        ]
-    return raw_figures(score_motions(motions, fragments, material, contact))
+        motions = [path_pose_motion(model, flow, dataset, f, label) for f, label in zip(fragments, labels, strict=True)]
+    return raw_figures(score_motions(motions, fragments, dataset, contact))
 
 
 def _survival(agent: Agent, settings: dict[str, Any]) -> dict[str, list[int]]:
@@ -147,7 +145,7 @@ def _survival(agent: Agent, settings: dict[str, Any]) -> dict[str, list[int]]:
 
     ``policy``: its mean action. The others need no training, see :mod:`egopose.training.survival`.
     """
-    env = agent.make_env("train", worlds=int(settings["survival"]["worlds"]), threads=int(settings["threads"]))
+    env = agent.make_env("train", num_envs=int(settings["survival"]["num_envs"]), threads=int(settings["threads"]))
     acting = {"policy": agent.actor, "base_tracking": base_tracking(env), "reference_tracking": reference_tracking(env)}
     seed = int(settings["survival"]["seed"])
     out = {name: frames_survived(env, controller, seed).frames.tolist() for name, controller in acting.items()}
@@ -163,7 +161,7 @@ def _forecasts(
     forecast = from_mapping(ForecastSettings, own, "conf/evaluate.yaml: forecast")
     if job.verb == "train":
         agent = load_agent(folder, which="latest")
-        material = agent.material
+        dataset = agent.dataset
         windows = windows_of(agent, "test", forecast)
         # As the baselines: what the run's own state regressor sees in the contexts alone.
         pasts = past_states(agent, windows, "regressor")
@@ -171,15 +169,15 @@ def _forecasts(
         planner = planner_settings(settings.get("planner"))
         futures = forecast_windows_of(agent, windows, states, 1, forecast, int(settings["threads"]), planner).qpos
     else:
-        material = _material(folder, config, judged)
+        dataset = _material(folder, config, judged)
         baseline = load_baseline(folder)
         assert isinstance(baseline.model, RecurrentForecaster), f"{job.method} forecasts nothing"
         made = baseline.settings
-        windows = forecast_windows(material.test, made.context, forecast.horizon or made.horizon, forecast.every)
-        futures = forecast_qpos(baseline.model, _contexts(material, judged, windows), material, windows)[:, None]
-    truth = _truth(material, windows)
-    hands = [int(d) for d in material.humanoid.hand_dofs]
-    scores = score_forecasts(truth, windows, futures, hands, 1.0 / material.humanoid.control_dt)
+        windows = forecast_windows(dataset.test, made.context, forecast.horizon or made.horizon, forecast.every)
+        futures = forecast_qpos(baseline.model, _contexts(dataset, judged, windows), dataset, windows)[:, None]
+    truth = _truth(dataset, windows)
+    hands = [int(d) for d in dataset.humanoid.hand_dofs]
+    scores = score_forecasts(truth, windows, futures, hands, 1.0 / dataset.humanoid.control_dt)
     takes = TakeStore.open(store_folder(judged)).takes
     return {
         "takes": [takes[number].name for number in sorted({w.take for w in windows})],
@@ -189,16 +187,16 @@ def _forecasts(
     }
 
 
-def _contexts(material: Material, config: dict[str, Any], windows: Sequence[ForecastWindow]) -> torch.Tensor:
+def _contexts(dataset: Dataset, config: dict[str, Any], windows: Sequence[ForecastWindow]) -> torch.Tensor:
     """``[W, context, S]``: what the state regressor sees in the frames of each context alone."""
-    assert material.regressor is not None
-    model, made_with = load_regressor(material.regressor)
+    assert dataset.regressor is not None
+    model, source_config = load_regressor(dataset.regressor)
     store = TakeStore.open(store_folder(config))
-    seen = seen_in_store(config, made_with["regressor"], store, flow_name(config))
-    first = [int(material.takes.offsets[w.take]) + w.start for w in windows]
+    seen = seen_in_store(config, source_config["regressor"], store, flow_name(config))
+    first = [int(dataset.takes.offsets[w.take]) + w.start for w in windows]
     return context_states(model, seen, first, windows[0].context)
 
 
-def _truth(material: Material, windows: Sequence[ForecastWindow]) -> Array:
-    reference = torch.as_tensor(material.reference["qpos"]).double().numpy()
-    return true_futures(reference, material.takes.offsets.tolist(), windows)
+def _truth(dataset: Dataset, windows: Sequence[ForecastWindow]) -> Array:
+    reference = torch.as_tensor(dataset.reference["qpos"]).double().numpy()
+    return true_futures(reference, dataset.takes.offsets.tolist(), windows)

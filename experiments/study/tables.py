@@ -242,8 +242,8 @@ def estimation_table(found: Mapping[tuple[str, str], Scores], measured: Mapping[
             seeds = scores.seeds(folds)
             cells = [_cell(_interval(scores, METRICS[h], folds, seeds)) for h in heads]
             takes = sum(len(names) for names in scores.takes(folds))
-            told = [*_resets(scores, folds, seeds), _fallen(scores, folds, seeds), str(len(seeds)), str(takes)]
-            lines.append(_row([LABELS[method], *cells, *told]))
+            reported = [*_resets(scores, folds, seeds), _fallen(scores, folds, seeds), str(len(seeds)), str(takes)]
+            lines.append(_row([LABELS[method], *cells, *reported]))
         lines += ["", *_ratio_rows([f"{protocol}/{h}" for h in heads], measured), ""]
     return lines
 
@@ -277,8 +277,8 @@ def ablation_table(found: Mapping[tuple[str, str], Scores]) -> list[str]:
         lines.append(_row([label, f"{resets:g}", *cells, *(f"{v:g}" for v in paper)]))
     takes = sum(len(names) for names in next(iter(rows.values())).takes(folds))
     without = ", ".join(fold.removeprefix("without") for fold in folds)
-    told = f"The policy alone, no planner, in every row. Left out: {without}; {takes} takes, {len(seeds)} seed"
-    return [*lines, "", f"{told}{'s' if len(seeds) > 1 else ''} of every row. Resets: a whole pass over them."]
+    reported = f"The policy alone, no planner, in every row. Left out: {without}; {takes} takes, {len(seeds)} seed"
+    return [*lines, "", f"{reported}{'s' if len(seeds) > 1 else ''} of every row. Resets: a whole pass over them."]
 
 
 def horizon_table(found: Mapping[tuple[str, str], Scores], measured: Mapping[str, Mapping[str, Any]]) -> list[str]:
@@ -318,9 +318,9 @@ def _cell(interval: Interval | None) -> str:
 
 
 def _resets(scores: Scores, folds: Sequence[str], seeds: Sequence[int]) -> tuple[str, str]:
-    found = [scores.results[fold][seed] for fold in folds for seed in seeds]
-    resets = np.concatenate([one["resets"] for one in found])
-    minutes = sum(sum(one["frames"]) for one in found) / 30 / 60
+    result = [scores.results[fold][seed] for fold in folds for seed in seeds]
+    resets = np.concatenate([one["resets"] for one in result])
+    minutes = sum(sum(one["frames"]) for one in result) / 30 / 60
     return f"{resets.sum() / minutes:.2f}", f"{(resets == 0).mean():.0%}"
 
 
@@ -329,13 +329,13 @@ def _ratio_rows(names: Sequence[str], measured: Mapping[str, Mapping[str, Any]])
         _row(
             [
                 name,
-                f"{found['ratio']:.3f} [{found['low']:.3f}, {found['high']:.3f}]",
-                "" if found["paper"] is None else f"{found['paper']:.3f}",
-                str(found["seeds"]),
-                str(found["takes"]),
+                f"{result['ratio']:.3f} [{result['low']:.3f}, {result['high']:.3f}]",
+                "" if result["paper"] is None else f"{result['paper']:.3f}",
+                str(result["seeds"]),
+                str(result["takes"]),
             ]
         )
-        for name, found in measured.items()
+        for name, result in measured.items()
         if name.rsplit("/", 1)[0] in names
     ]
     return [*_header(["ours / baseline", "ratio (95 %)", "the paper's", "seeds", "takes"]), *rows] if rows else []
@@ -351,8 +351,8 @@ def _row(cells: Sequence[str]) -> str:
 
 def write_tables(results: Path) -> dict[str, dict[str, Any]]:
     """``ratios.json`` and a README.md in each table's folder; returns the ratios."""
-    found = gather(results)
-    measured = ratios(found)
+    result = gather(results)
+    measured = ratios(result)
     write_json(results / "ratios.json", measured)
     note = [
         "*Written by `experiments/study/tables.py` from `raw/`; do not edit.* Means over takes, then seeds, and",
@@ -365,9 +365,9 @@ def write_tables(results: Path) -> dict[str, dict[str, Any]]:
         "",
     ]
     tables = {
-        ESTIMATION: ("Table 1: estimation", estimation_table(found, measured)),
-        ABLATIONS: ("Table 2: ablations, cross subject", ablation_table(found)),
-        HORIZONS: ("Table 3: forecasting by horizon", horizon_table(found, measured)),
+        ESTIMATION: ("Table 1: estimation", estimation_table(result, measured)),
+        ABLATIONS: ("Table 2: ablations, cross subject", ablation_table(result)),
+        HORIZONS: ("Table 3: forecasting by horizon", horizon_table(result, measured)),
     }
     for folder, (title, lines) in tables.items():
         if (results / folder / "raw").is_dir():
@@ -384,9 +384,9 @@ def main() -> None:
     except InputError as error:
         print(f"error: {error}", file=sys.stderr)
         raise SystemExit(2) from None
-    for name, found in measured.items():
-        paper = "" if found["paper"] is None else f"  paper {found['paper']:.3f}"
-        print(f"{name:32s} {found['ratio']:.3f} [{found['low']:.3f}, {found['high']:.3f}]{paper}")
+    for name, result in measured.items():
+        paper = "" if result["paper"] is None else f"  paper {result['paper']:.3f}"
+        print(f"{name:32s} {result['ratio']:.3f} [{result['low']:.3f}, {result['high']:.3f}]{paper}")
 
 
 if __name__ == "__main__":

@@ -16,15 +16,16 @@ def main(config: DictConfig) -> None:
     from egopose.data.sync import run_sync
 
     try:
-        found = run_sync(resolved(config))
+        result = run_sync(resolved(config))
     except InputError as error:
         print(f"error: {error}", file=sys.stderr)
         raise SystemExit(2) from None
     print(
-        f"sync_offset: {found.offset:.3f}   # s; correlation {found.correlation:.2f}, confidence {found.confidence:.2f}"
+        f"sync_offset: {result.offset:.3f}   # s; correlation {result.correlation:.2f}, "
+        f"confidence {result.confidence:.2f}"
     )
-    if found.offset < 0:
-        print(f"The motion begins {-found.offset:.3f} s before the video: cut that much off its beginning.")
+    if result.offset < 0:
+        print(f"The motion begins {-result.offset:.3f} s before the video: cut that much off its beginning.")
 
 
 if __name__ == "__main__":

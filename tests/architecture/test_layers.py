@@ -98,7 +98,7 @@ def test_a_verb_reads_arguments_makes_a_call_and_prints() -> None:
 
 
 def test_imports_inside_functions_are_of_optional_packages() -> None:
-    """A core package is imported at the head of a file, where a reader looks for it; a verb may wait with its library."""
+    """Imports stand at the head of a file; only a verb may wait with its library."""
     inside = []
     for module, path in modules().items():
         for function in ast.walk(ast.parse(path.read_text(encoding="utf8"))):

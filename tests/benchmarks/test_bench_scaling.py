@@ -19,7 +19,7 @@ from egopose.benchmarks.process_memory import mapped_mb, private_mb, proportiona
 
 SIMULATION = Path(__file__).parents[2] / "experiments" / "scaling" / "simulate.py"
 COST: dict[str, Any] = {
-    "worlds": 32,
+    "num_envs": 32,
     "epochs": 5,
     "steps_per_iteration": 8192,
     "physics_s": 1e-4,

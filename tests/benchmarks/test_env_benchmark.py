@@ -13,7 +13,7 @@ from torchrl.collectors import Collector
 
 from egopose.benchmarks.raw_replay import RawReplay, StepRecorder, compare_with_raw
 from egopose.core import runtime
-from egopose.core.torch_settings import prefer_quick_products
+from egopose.core.torch_settings import enable_onednn_matmul
 
 
 def collector(env) -> Collector:
@@ -32,10 +32,10 @@ def test_rates_and_keys() -> None:
     loop = collector(env)
     result = compare_with_raw(iter(loop), env.physics, rounds=3)
     loop.shutdown()
-    assert {"ratio", "cpu_ratio", "control_steps_per_s", "raw_steps_per_s", "substeps", "worlds", "threads"} <= set(
+    assert {"ratio", "cpu_ratio", "control_steps_per_s", "raw_steps_per_s", "substeps", "num_envs", "threads"} <= set(
         result
     )
-    assert (result["worlds"], result["threads"]) == (4, 2)
+    assert (result["num_envs"], result["threads"]) == (4, 2)
     # A batch of collection can never cost less than its physics by much; noise aside.
     assert 0 < result["ratio"] < 1.5
 
@@ -75,7 +75,7 @@ def test_the_runtime_is_prepared_before_torch() -> None:
 def test_quick_products_keep_single_precision() -> None:
     """As numpy's double precision says, whichever library multiplies; bfloat16 would be off by 2e-3."""
     code = (
-        "import torch; from egopose.core.runtime import prefer_quick_products; quick = prefer_quick_products();"
+        "import torch; from egopose.core.runtime import enable_onednn_matmul; quick = enable_onednn_matmul();"
         "setting = torch.backends.mkldnn.matmul.fp32_precision; assert (setting == 'bf16') == quick, setting;"
         "a, b = torch.randn(500, 700), torch.randn(700, 300); exact = a.double().numpy() @ b.double().numpy();"
         "error = (((a @ b).numpy() - exact) ** 2).mean() ** 0.5 / exact.std(); assert error < 5e-6, error"
@@ -86,5 +86,5 @@ def test_quick_products_keep_single_precision() -> None:
 def test_products_of_fewer_digits_are_left_off(monkeypatch) -> None:
     before = torch.backends.mkldnn.matmul.fp32_precision
     monkeypatch.setattr(runtime, "_keeps_single_precision", lambda *sizes: False)
-    assert not prefer_quick_products.__wrapped__()
+    assert not enable_onednn_matmul.__wrapped__()
     assert torch.backends.mkldnn.matmul.fp32_precision == before

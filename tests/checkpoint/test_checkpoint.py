@@ -234,7 +234,7 @@ def test_networks_of_another_size_are_refused(saved: tuple[Run, Path], tmp_path:
 
 def test_another_number_of_worlds_is_refused(saved: tuple[Run, Path], tmp_path: Path) -> None:
     with pytest.raises(InputError, match="simulation"):
-        make_run(tmp_path, worlds=4).restore(saved[1])
+        make_run(tmp_path, num_envs=4).restore(saved[1])
 
 
 def test_unknown_run_directories(tmp_path: Path) -> None:

@@ -27,7 +27,7 @@ from egopose.core.errors import InputError
 from egopose.data.preparation import humanoid_of
 from egopose.evaluation.options import data_at, output_folder
 from egopose.inference.video import estimate_video
-from egopose.inference.video_regression import seen_in, video_material
+from egopose.inference.video_regression import seen_in, video_dataset
 from egopose.pipeline.agent import _other_store
 from egopose.pipeline.regressor import load_regressor
 from egopose.pipeline.run import build_run
@@ -49,12 +49,14 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     config = read_json(find_checkpoint(f"{weights.PREFIX}{NAME}"), "config")
     config["data"] = {**config["data"], "folder": str(folder), "store": str(folder / "store")}
     config["output"] = str(folder)
-    config["collector"] |= {"worlds": 2, "lanes": 1, "physics_threads": 1}
+    config["collector"] |= {"num_envs": 2, "env_groups": 1, "physics_threads": 1}
     config["algo"] |= {"steps_per_iteration": 16, "minibatch_size": 16}
-    regressor, made_with = load_regressor(weights.FOLDER / NAME / "regressor")
+    regressor, source_config = load_regressor(weights.FOLDER / NAME / "regressor")
     flow = np.zeros((210, 2, 32, 32), np.float16)
-    material, _ = video_material(humanoid_of(config), seen_in(humanoid_of(config), regressor, flow, made_with), "none")
-    seen_by = replace(material, regressor=weights.FOLDER / NAME / "regressor")
+    dataset, _ = video_dataset(
+        humanoid_of(config), seen_in(humanoid_of(config), regressor, flow, source_config), "none"
+    )
+    seen_by = replace(dataset, regressor=weights.FOLDER / NAME / "regressor")
     made = build_run(config, folder, seen_by)
     made.save()
     made.collector.shutdown()

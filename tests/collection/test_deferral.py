@@ -27,7 +27,7 @@ from egopose.collection.stepping import TransformedEgoPoseEnv
 from egopose.envs.transforms import StateNormalizer
 
 WORLDS, STEPS = 5, 20
-SETTINGS = CollectorSettings("sync", worlds=WORLDS, physics_threads=1, workers=1, threads=1, update_threads=1)
+SETTINGS = CollectorSettings("sync", num_envs=WORLDS, physics_threads=1, workers=1, threads=1, update_threads=1)
 
 
 def make_env(number: int = 0) -> TransformedEgoPoseEnv:
@@ -99,8 +99,8 @@ def test_lanes_that_take_turns_give_what_all_worlds_in_step_give() -> None:
         return_log_prob=True,
     )
     together, in_turn = (
-        build_collector(replace(SETTINGS, lanes=lanes, physics_threads=2), steady_env, actor, WORLDS * STEPS)
-        for lanes in (1, 2)
+        build_collector(replace(SETTINGS, env_groups=env_groups, physics_threads=2), steady_env, actor, WORLDS * STEPS)
+        for env_groups in (1, 2)
     )
     for _, a, b in zip(range(3), together, in_turn, strict=False):
         assert a["next", "done"].any()
@@ -111,7 +111,7 @@ def test_lanes_that_take_turns_give_what_all_worlds_in_step_give() -> None:
 
 
 def test_a_lane_that_is_resumed_goes_on_to_the_bit() -> None:
-    build = partial(build_collector, replace(SETTINGS, lanes=2), make_env, make_actor(make_env()), WORLDS * STEPS)
+    build = partial(build_collector, replace(SETTINGS, env_groups=2), make_env, make_actor(make_env()), WORLDS * STEPS)
     first, second = build(), build()
     batches, again = iter(first), iter(second)
     next(batches)
@@ -125,7 +125,7 @@ def test_a_lane_that_is_resumed_goes_on_to_the_bit() -> None:
 
 
 def test_a_batch_of_lanes_can_be_learned_from() -> None:
-    collector = build_collector(replace(SETTINGS, lanes=2), make_env, make_actor(make_env()), WORLDS * STEPS)
+    collector = build_collector(replace(SETTINGS, env_groups=2), make_env, make_actor(make_env()), WORLDS * STEPS)
     batch = next(iter(collector))
     weight = torch.ones(batch["humanoid_state"].shape[-1], requires_grad=True)
     (batch["humanoid_state"] @ weight).sum().backward()
@@ -134,7 +134,7 @@ def test_a_batch_of_lanes_can_be_learned_from() -> None:
 
 def test_a_diverged_world_earns_nothing_when_its_reward_comes_late() -> None:
     env = environment(3)
-    env.defer_rewards()
+    env.make_rewards_lazy()
     td = env.reset()
     action = torch.zeros(env.action_spec.shape)
     action[1] = torch.nan
@@ -153,7 +153,7 @@ def test_an_environment_defers_only_when_told_and_its_specs_follow() -> None:
     env = make_env()
     check_env_specs(env)
     assert "reward_terms" in env.observation_spec
-    env.defer_rewards()
+    env.make_rewards_lazy()
     assert "reward_terms" not in env.observation_spec
     assert "reward_terms" not in env.reset()
 
@@ -166,7 +166,7 @@ def test_a_state_from_before_rewards_were_deferred_goes_on() -> None:
     next(batches)
     simulation, transforms = simulation_state(first), transform_state(first)
     old = {**simulation["carrier"], "reward_terms.pose": torch.zeros(WORLDS, 1)}
-    simulation = {"carrier": old, "worlds": simulation["worlds"]}
+    simulation = {"carrier": old, "num_envs": simulation["num_envs"]}
     again = iter(second)
     load_transform_state(second, {key: value.clone() for key, value in transforms.items()})
     load_simulation_state(second, simulation)

@@ -50,7 +50,7 @@ def networks_of(seed: int) -> tuple[Any, Any]:
 def make_run(folder: Path, kind: str, seed: int = 3) -> Run:
     actor, critic = networks_of(seed)
     loop = LoopSettings.from_config({**LOOP, "steps_per_iteration": WORKERS * WORLDS * STEPS})
-    chosen = CollectorSettings.from_config({**COLLECTOR, "kind": kind, "worlds": WORLDS, "workers": WORKERS})
+    chosen = CollectorSettings.from_config({**COLLECTOR, "kind": kind, "num_envs": WORLDS, "workers": WORKERS})
     collector = build_collector(chosen, normalized_toy, actor, loop.steps_per_iteration)
     ppo = PPO(actor, critic, PPOSettings.from_config(SETTINGS))
     return Run(ppo, collector, loop, chosen, folder, {"task": {"name": "toy"}}, action_size=2)
@@ -230,7 +230,7 @@ def test_a_missing_ray_is_one_clear_line(monkeypatch: pytest.MonkeyPatch) -> Non
             normalized_toy,
             networks()[0],
             workers=1,
-            worlds=WORLDS,
+            num_envs=WORLDS,
             steps_per_iteration=8,
             threads=1,
             cpus=1,

@@ -19,7 +19,7 @@ from egopose.data.sync import find_offset, head_turning, settings_of, sync_offse
 from egopose.motion.io import read_motion, write_motion
 from egopose.motion.motion import Motion
 from egopose.sync import run_sync
-from egopose.vision.camera_rotation import camera_turning
+from egopose.vision.camera_rotation import camera_rotation
 from egopose.vision.flow import FlowConfig
 from egopose.vision.lens import Camera
 from egopose.vision.video import read_frames, write_video
@@ -133,7 +133,7 @@ def test_a_turn_is_read_from_its_flow(turn: tuple[float, float, float], view: fl
     seen = Rotation.from_rotvec(-np.array(turn)).apply(rays)
     flow = (seen[:, :2] / seen[:, 2:] * focal - np.stack([x, y], -1).reshape(-1, 2)).T.reshape(1, 2, side, side)
     flow[:, :, :6, :6] += 0.2  # a hand
-    np.testing.assert_allclose(camera_turning(flow, view)[0], turn, atol=3e-3)
+    np.testing.assert_allclose(camera_rotation(flow, view)[0], turn, atol=3e-3)
 
 
 def test_a_still_video_turns_nowhere(tmp_path: Path) -> None:

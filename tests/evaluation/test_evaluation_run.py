@@ -26,17 +26,17 @@ from egopose.motion.motion import Motion
 from egopose.pipeline.agent import Agent
 from egopose.pipeline.environment import build_env
 from egopose.pipeline.networks import build_networks
-from egopose.tasks.dataset import Material
+from egopose.tasks.dataset import Dataset
 from egopose.vision.video import probe_video, write_video
 
 FRAMES = 24
 EVALUATE = {
     "split": "test",
-    "failsafe": {"mode": "value", "kappa": 0.6, "fallen_height": 0.3},
+    "failsafe": {"mode": "value", "reset_threshold": 0.6, "fallen_height": 0.3},
     "failsafe_report": {"window": 5},
     "contact": {"height": 0.03, "speed": 0.5},
     "interval": {"level": 0.95, "draws": 50, "seed": 0},
-    "survival": {"worlds": 3, "seed": 1},
+    "survival": {"num_envs": 3, "seed": 1},
     "video": {"takes": 1, "size": 64},
     "threads": 1,
 }
@@ -53,7 +53,7 @@ def agent() -> Agent:
     heads = states["xpos"][:, humanoid.head, 2].min().expand(2).clone()
     takes = TakeTable(torch.tensor([0, FRAMES]), torch.tensor([FRAMES, FRAMES]), heads)
     regressed = humanoid_state(reference).float()
-    material = Material(
+    dataset = Dataset(
         humanoid,
         reference,
         takes,
@@ -70,9 +70,9 @@ def agent() -> Agent:
         "regressor": {"std_floor": 0.05},
         "model": {**group("model", "fast"), "hidden": [8]},
     }
-    actor, critic = build_networks(config, material, build_env(config, material, worlds=1))
-    make_env = partial(build_env, config, material)
-    return Agent(actor, critic, config, material, make_env, Path("run/checkpoints/1"))
+    actor, critic = build_networks(config, dataset, build_env(config, dataset, num_envs=1))
+    make_env = partial(build_env, config, dataset)
+    return Agent(actor, critic, config, dataset, make_env, Path("run/checkpoints/1"))
 
 
 def test_everything_is_written_and_agrees(agent: Agent, tmp_path: Path) -> None:
@@ -95,7 +95,7 @@ def test_everything_is_written_and_agrees(agent: Agent, tmp_path: Path) -> None:
     assert saved["survival"][0]["policy"]["frames"] > 0
 
     guarded = saved["failsafe"][0]
-    assert (guarded["mode"], guarded["kappa"], guarded["window_frames"]) == ("value", 0.6, 5)
+    assert (guarded["mode"], guarded["reset_threshold"], guarded["window_frames"]) == ("value", 0.6, 5)
     assert [len(take["confidence"]) for take in guarded["takes"]] == [FRAMES - 4, 12]
 
     take = tmp_path / "out/takes/walk_1_4-24"

@@ -7,8 +7,8 @@ from typing import Any
 
 import pytest
 from test_forecasting_training import configuration as forecasting_configuration
-from test_forecasting_training import forecasting_material
-from test_training_pipeline import configuration, estimation_material
+from test_forecasting_training import forecasting_dataset
+from test_training_pipeline import configuration, estimation_dataset
 from torchrl.render import RenderConfig, render_policy
 
 from egopose.checkpoint.checkpoint import find_checkpoint
@@ -17,7 +17,7 @@ from egopose.evaluation.torchrl_evaluator import checkpoint_evaluator
 from egopose.evaluation.torchrl_render import make_env, make_policy
 from egopose.pipeline.agent import load_agent
 from egopose.pipeline.run import build_run
-from egopose.tasks.dataset import Material
+from egopose.tasks.dataset import Dataset
 from egopose.training.loop import train
 from egopose.training.survival import frames_survived
 
@@ -27,31 +27,31 @@ WORLDS, SEED = 5, 7
 def falling(config: dict[str, Any]) -> dict[str, Any]:
     """The body counts as fallen soon, so that episodes end at different times."""
     task = {**config["task"], "termination": {"enabled": True, "head_drop": 0.02}}
-    return {**config, "task": task, "training": {**config["training"], "evaluation_worlds": 12}}
+    return {**config, "task": task, "training": {**config["training"], "evaluation_num_envs": 12}}
 
 
 @pytest.fixture(scope="module")
-def estimating(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Material]:
-    folder, material = tmp_path_factory.mktemp("estimating"), estimation_material()
-    train(build_run(falling(configuration()), folder, material), [])
-    return folder, material
+def estimating(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Dataset]:
+    folder, dataset = tmp_path_factory.mktemp("estimating"), estimation_dataset()
+    train(build_run(falling(configuration()), folder, dataset), [])
+    return folder, dataset
 
 
 @pytest.fixture(scope="module")
-def forecasting(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Material]:
-    folder, material = tmp_path_factory.mktemp("forecasting"), forecasting_material()
-    train(build_run(falling(forecasting_configuration()), folder, material), [])
-    return folder, material
+def forecasting(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Dataset]:
+    folder, dataset = tmp_path_factory.mktemp("forecasting"), forecasting_dataset()
+    train(build_run(falling(forecasting_configuration()), folder, dataset), [])
+    return folder, dataset
 
 
-def survived(folder: Path, material: Material) -> tuple[float, float]:
-    agent = load_agent(folder, material, which="latest")
-    found = frames_survived(agent.make_env("test", worlds=WORLDS), agent.actor, SEED)
+def survived(folder: Path, dataset: Dataset) -> tuple[float, float]:
+    agent = load_agent(folder, dataset, which="latest")
+    found = frames_survived(agent.make_env("test", num_envs=WORLDS), agent.actor, SEED)
     return found.mean, float(found.fell.double().mean())
 
 
-def same_figures(folder: Path, material: Material, backend: str) -> None:
-    evaluator = checkpoint_evaluator(folder, backend, which="latest", worlds=WORLDS, seed=SEED, material=material)
+def same_figures(folder: Path, dataset: Dataset, backend: str) -> None:
+    evaluator = checkpoint_evaluator(folder, backend, which="latest", num_envs=WORLDS, seed=SEED, dataset=dataset)
     try:
         results = [evaluator.evaluate(), evaluator.evaluate()]
         assert evaluator.trigger_eval(step=30)
@@ -60,17 +60,17 @@ def same_figures(folder: Path, material: Material, backend: str) -> None:
         evaluator.shutdown()
     assert results[2]["eval/step"] == 30
     for result in results:
-        assert (result["eval/frames"], result["eval/fell"]) == pytest.approx(survived(folder, material))
+        assert (result["eval/frames"], result["eval/fell"]) == pytest.approx(survived(folder, dataset))
 
 
-def test_a_thread_finds_what_survival_is(estimating: tuple[Path, Material]) -> None:
+def test_a_thread_finds_what_survival_is(estimating: tuple[Path, Dataset]) -> None:
     frames, fell = survived(*estimating)
     assert 0 < fell < 1
     assert 0 < frames < 11
     same_figures(*estimating, "thread")
 
 
-def test_a_forecasting_policy_keeps_its_memory(forecasting: tuple[Path, Material]) -> None:
+def test_a_forecasting_policy_keeps_its_memory(forecasting: tuple[Path, Dataset]) -> None:
     same_figures(*forecasting, "thread")
 
 
@@ -79,17 +79,17 @@ def test_a_process_of_its_own_finds_the_same(task: str, request: pytest.FixtureR
     same_figures(*request.getfixturevalue(task), "process")
 
 
-def test_other_backends_are_named(estimating: tuple[Path, Material]) -> None:
+def test_other_backends_are_named(estimating: tuple[Path, Dataset]) -> None:
     with pytest.raises(InputError, match="backend: must be one of thread, process"):
-        checkpoint_evaluator(estimating[0], "fork", material=estimating[1])
+        checkpoint_evaluator(estimating[0], "fork", dataset=estimating[1])
 
 
-def test_torchrl_renders_a_checkpoint(estimating: tuple[Path, Material], tmp_path: Path) -> None:
-    folder, material = estimating
+def test_torchrl_renders_a_checkpoint(estimating: tuple[Path, Dataset], tmp_path: Path) -> None:
+    folder, dataset = estimating
     config = RenderConfig(
         ckpt=find_checkpoint(folder),
-        env=lambda config: make_env(config, 64, material),
-        policy=lambda ckpt_path: make_policy(ckpt_path, material),
+        env=lambda config: make_env(config, 64, dataset),
+        policy=lambda ckpt_path: make_policy(ckpt_path, dataset),
         format="npz",
         max_steps=4,
         out=tmp_path / "rollout.npz",

@@ -1,4 +1,5 @@
-"""The fail-safe judged by what would have come without it; kappa at other discounts; confidence beside the motion."""
+"""The fail-safe judged by what would have come without it; reset_threshold at other discounts; confidence beside the
+motion."""
 
 from __future__ import annotations
 
@@ -19,9 +20,9 @@ from egopose.envs.mdp.observations import humanoid_state
 from egopose.envs.transforms import StateNormalizer
 from egopose.evaluation.reset_threshold import chosen
 from egopose.evaluation.resets import CUT_SHORT, FALSE_ALARM, FORESEEN, LATE, as_dict, as_text, summary, take_triggers
-from egopose.inference.counterfactuals import Forks
+from egopose.inference.counterfactuals import CounterfactualRollouts
 from egopose.inference.estimator import Estimate, estimate_takes
-from egopose.inference.failsafe import FailSafe, FailSafeSettings, paper_kappa
+from egopose.inference.failsafe import FailSafe, FailSafeSettings, paper_threshold
 from egopose.motion.io import read_motion, write_motion
 from egopose.motion.io.csv_table import write_csv
 from egopose.motion.motion import Motion
@@ -57,12 +58,12 @@ def test_every_kind_of_trigger_and_miss_is_told_apart() -> None:
 
 
 def test_what_would_have_come_is_what_comes_without_a_fail_safe() -> None:
-    def make_env(worlds: int) -> TransformedEnv:
+    def make_env(num_envs: int) -> TransformedEnv:
         given = problem(termination={"enabled": False, "head_drop": 0.02})
-        base = environment(worlds, problem=given, whole_fragments=True)
+        base = environment(num_envs, problem=given, whole_fragments=True)
         return TransformedEnv(base, Compose(StateNormalizer(base.observation_spec["humanoid_state"].shape[-1])))
 
-    def run(mode: str, forks: Forks | None) -> list[Estimate]:
+    def run(mode: str, counterfactuals: CounterfactualRollouts | None) -> list[Estimate]:
         env = make_env(len(PIECES))
         base = env.base_env
         states = humanoid_state(base.problem.reference_at(torch.arange(base.problem.n_frames))).float()
@@ -70,19 +71,19 @@ def test_what_would_have_come_is_what_comes_without_a_fail_safe() -> None:
             lambda step: torch.where(step == 2, 0.0, 10.0), in_keys=["episode_step"], out_keys=["state_value"]
         )
         guard = FailSafe(len(PIECES), FailSafeSettings(mode, 0.6, 0.3))
-        return estimate_takes(env, base_tracking(env), critic, states, guard, forks=forks)
+        return estimate_takes(env, base_tracking(env), critic, states, guard, counterfactuals=counterfactuals)
 
-    forks = Forks()
-    guarded = run("value", forks)
+    counterfactuals = CounterfactualRollouts()
+    guarded = run("value", counterfactuals)
     assert [np.flatnonzero(e.triggered).tolist() for e in guarded] == [[2], [2]]
-    assert forks.places == [(world, e.start + 2) for world, e in enumerate(guarded)]
+    assert counterfactuals.places == [(world, e.start + 2) for world, e in enumerate(guarded)]
     falls = [np.flatnonzero(e.fallen) for e in run("off", None)]
     assert any(len(at) and at[0] > 2 for at in falls)
     wanted = [int(at[0]) - 2 if len(at) else None for at in falls]
     two = make_env(2)
-    assert forks.frames_to_fall(make_env, base_tracking(two), window=100) == wanted
+    assert counterfactuals.frames_to_fall(make_env, base_tracking(two), window=100) == wanted
     soon = min(frames for frames in wanted if frames)
-    assert all(frames is None for frames in forks.frames_to_fall(make_env, base_tracking(two), soon - 1))
+    assert all(frames is None for frames in counterfactuals.frames_to_fall(make_env, base_tracking(two), soon - 1))
 
 
 @given(discount=st.floats(0.5, 0.999))
@@ -92,22 +93,24 @@ def test_kappa_keeps_its_frames_to_the_end_at_any_discount(discount: float) -> N
     assert 17 < frames < 18
     ends, goes_on = (sum(discount**k for k in range(int(count))) for count in (frames, 20000))
     longer = ends + discount ** int(frames)
-    assert ends / goes_on - 1e-6 <= paper_kappa(discount) <= longer / goes_on + 1e-6
-    assert paper_kappa(0.95) == pytest.approx(0.6)
+    assert ends / goes_on - 1e-6 <= paper_threshold(discount) <= longer / goes_on + 1e-6
+    assert paper_threshold(0.95) == pytest.approx(0.6)
 
 
 def test_kappa_comes_from_the_command_line_or_the_runs_discount() -> None:
     unset = FailSafeSettings("value", None, 0.3)
-    assert unset.for_run({"algo": {"gamma": 0.99}}).kappa == pytest.approx(0.164, abs=5e-4)
-    assert FailSafeSettings("value", 0.2, 0.3).for_run({}).kappa == 0.2
-    with pytest.raises(ValueError, match="kappa"):
+    assert unset.for_run({"algo": {"gamma": 0.99}}).reset_threshold == pytest.approx(0.164, abs=5e-4)
+    assert FailSafeSettings("value", 0.2, 0.3).for_run({}).reset_threshold == 0.2
+    with pytest.raises(ValueError, match="reset_threshold"):
         FailSafe(1, unset)
     with pytest.raises(InputError, match="gamma"):
-        paper_kappa(1.0)
+        paper_threshold(1.0)
 
 
 def test_the_best_kappa_is_that_of_the_largest_f1() -> None:
-    rows = [{"kappa": k, "f1": f1} for k, f1 in ((0.1, None), (0.2, 0.9), (0.3, 0.95), (0.4, 0.95), (0.5, 0.4))]
+    rows = [
+        {"reset_threshold": k, "f1": f1} for k, f1 in ((0.1, None), (0.2, 0.9), (0.3, 0.95), (0.4, 0.95), (0.5, 0.4))
+    ]
     assert chosen(rows) == 0.3
     with pytest.raises(InputError, match="nothing to choose by"):
         chosen(rows[:1])

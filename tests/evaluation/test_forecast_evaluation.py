@@ -27,7 +27,7 @@ from egopose.evaluation.reports import evaluation_report
 from egopose.humanoid.config import HumanoidConfig, SimConfig
 from egopose.humanoid.model import build_humanoid
 from egopose.inference.context_states import context_states
-from egopose.inference.forecast_contexts import _states, context_material, past_states
+from egopose.inference.forecast_contexts import _states, context_dataset, past_states
 from egopose.inference.outputs import TakeVideo
 from egopose.inference.video_regression import require_estimation
 from egopose.models.predictions import predict_span
@@ -37,7 +37,7 @@ from egopose.motion.motion import Motion
 from egopose.pipeline.agent import Agent
 from egopose.pipeline.environment import build_env
 from egopose.pipeline.networks import build_networks
-from egopose.tasks.dataset import Material
+from egopose.tasks.dataset import Dataset
 from egopose.vision.video import probe_video, write_video
 
 FRAMES, CONTEXT = 40, 5
@@ -51,10 +51,10 @@ EVALUATE: dict[str, Any] = {
         "noise_time": 0.3,
         "start": "reference",
         "estimator": None,
-        "worlds": 10,
+        "num_envs": 10,
         "seed": 0,
     },
-    "failsafe": {"mode": "value", "kappa": 0.6, "fallen_height": 0.3},
+    "failsafe": {"mode": "value", "reset_threshold": 0.6, "fallen_height": 0.3},
     "interval": {"level": 0.95, "draws": 50, "seed": 0},
     "video": {"takes": 1, "size": 64},
     "threads": 1,
@@ -69,7 +69,7 @@ def agent() -> Agent:
     qpos[:, 7:] = humanoid.rest_action + 0.05 * np.sin(np.linspace(0, 6, FRAMES))[:, None]
     states = reference_states(humanoid, Motion(humanoid.skeleton, qpos, 30.0))
     heads = states["xpos"][:, humanoid.head, 2].min().expand(2).clone()
-    material = Material(
+    dataset = Dataset(
         humanoid,
         torch.cat([states, states]),
         TakeTable(torch.tensor([0, FRAMES]), torch.tensor([FRAMES, FRAMES]), heads),
@@ -90,8 +90,8 @@ def agent() -> Agent:
             "memory": {"hidden_size": 7},
         },
     }
-    actor, critic = build_networks(config, material, build_env(config, material, worlds=1))
-    return Agent(actor, critic, config, material, partial(build_env, config, material), Path("run/checkpoints/1"))
+    actor, critic = build_networks(config, dataset, build_env(config, dataset, num_envs=1))
+    return Agent(actor, critic, config, dataset, partial(build_env, config, dataset), Path("run/checkpoints/1"))
 
 
 def test_everything_is_written_and_agrees(agent: Agent, tmp_path: Path) -> None:
@@ -131,7 +131,7 @@ def test_everything_is_written_and_agrees(agent: Agent, tmp_path: Path) -> None:
     assert len(forecast) == len(future) == 12
     assert not np.array_equal(forecast.qpos, future.qpos)
     np.testing.assert_allclose(
-        read_motion(folder / "reference.npz").qpos, agent.material.reference["qpos"][9:21].numpy(), atol=1e-6
+        read_motion(folder / "reference.npz").qpos, agent.dataset.reference["qpos"][9:21].numpy(), atol=1e-6
     )
     with (folder / "bands.csv").open() as stream:
         bands = list(csv.DictReader(stream))
@@ -147,7 +147,7 @@ def test_everything_is_written_and_agrees(agent: Agent, tmp_path: Path) -> None:
     assert (Path(seen["video"]), seen["rendered"]) == (video.path.resolve(), True)
     assert seen["start"] == pytest.approx(9 / 30)  # the first frame that was not seen
     assert not (out / "windows/bow_0/wearer.json").exists()
-    _check_page(evaluation_report(out, agent.material.humanoid, ["evaluation.size=64"]), saved)
+    _check_page(evaluation_report(out, agent.dataset.humanoid, ["evaluation.size=64"]), saved)
     (folder / "forecast.npz").unlink()
     with pytest.raises(InputError, match="evaluate anew"):
         evaluation_report(out, None)
@@ -188,29 +188,29 @@ def test_bad_settings_are_named(agent: Agent, tmp_path: Path) -> None:
 
 
 def test_contexts_become_takes_by_themselves(agent: Agent) -> None:
-    whole = agent.material
+    whole = agent.dataset
     frames = torch.cat([torch.arange(4, 9), torch.arange(40, 45)])
     names = ("visual_features", "visual_context", "joint_targets", "humanoid_state")
     seen = {name: torch.arange(10.0)[:, None].repeat(1, 3) for name in names}
-    material = context_material(whole, [4, 40], CONTEXT, seen)
-    assert material.takes.offsets.tolist() == [0, 5]
-    assert material.takes.lengths.tolist() == [5, 5]
-    assert torch.equal(material.reference["qpos"], whole.reference["qpos"][frames])
+    dataset = context_dataset(whole, [4, 40], CONTEXT, seen)
+    assert dataset.takes.offsets.tolist() == [0, 5]
+    assert dataset.takes.lengths.tolist() == [5, 5]
+    assert torch.equal(dataset.reference["qpos"], whole.reference["qpos"][frames])
     lowest = [float(whole.reference["xpos"][rows, whole.humanoid.head, 2].min()) for rows in frames.split(5)]
-    assert material.takes.lowest_head_height.tolist() == pytest.approx(lowest)
-    assert [(f.take, f.start, f.stop) for f in material.test] == [(0, 0, 5), (1, 0, 5)]
-    assert material.states is seen["humanoid_state"]
+    assert dataset.takes.lowest_head_height.tolist() == pytest.approx(lowest)
+    assert [(f.take, f.start, f.stop) for f in dataset.test] == [(0, 0, 5), (1, 0, 5)]
+    assert dataset.states is seen["humanoid_state"]
 
 
 def test_true_contexts_are_the_references_states(agent: Agent) -> None:
     windows = [ForecastWindow(0, 4, CONTEXT, 12), ForecastWindow(1, 0, CONTEXT, 12)]
     states = past_states(agent, windows, "reference")
-    every = humanoid_state(agent.material.reference)
+    every = humanoid_state(agent.dataset.reference)
     assert torch.equal(states, torch.stack([every[4:9], every[40:45]]))
 
 
 def test_where_the_fail_safe_moved_the_body_its_velocity_is_the_regressors(agent: Agent) -> None:
-    qpos = agent.material.reference["qpos"][:6].numpy()
+    qpos = agent.dataset.reference["qpos"][:6].numpy()
     dofs = qpos.shape[1] - 7
     regressed = torch.full((6, 11 + 2 * dofs), 7.0, dtype=torch.float64)
     plain = _states(qpos, np.zeros(6, dtype=bool), regressed, 30.0)

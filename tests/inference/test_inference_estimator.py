@@ -38,7 +38,7 @@ def run(
 ) -> tuple[list[Estimate], torch.Tensor]:
     base = env.base_env
     states = humanoid_state(base.problem.reference_at(torch.arange(base.problem.n_frames))).float() + offset
-    guard = FailSafe(len(PIECES), FailSafeSettings(mode, kappa=0.6, fallen_height=0.3))
+    guard = FailSafe(len(PIECES), FailSafeSettings(mode, reset_threshold=0.6, fallen_height=0.3))
     return estimate_takes(env, actor, critic, states, guard), states
 
 

@@ -9,8 +9,8 @@ from egopose.core.errors import InputError
 from egopose.inference.failsafe import FailSafe, FailSafeSettings
 
 
-def guarding(worlds: int, mode: str) -> FailSafe:
-    return FailSafe(worlds, FailSafeSettings(mode, kappa=0.6, fallen_height=0.3))
+def guarding(num_envs: int, mode: str) -> FailSafe:
+    return FailSafe(num_envs, FailSafeSettings(mode, reset_threshold=0.6, fallen_height=0.3))
 
 
 ACTIVE = torch.ones(2, dtype=torch.bool)

@@ -1,4 +1,4 @@
-"""Futures: deterministic, of any length, from the state given; bands that cover what they say."""
+"""ReferenceForecasts: deterministic, of any length, from the state given; bands that cover what they say."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from test_forecasting_training import CONTEXT, configuration, forecasting_material
+from test_forecasting_training import CONTEXT, configuration, forecasting_dataset
 
 from egopose.data.windows import ForecastWindow
 from egopose.envs.mdp.observations import humanoid_state
@@ -18,7 +18,7 @@ from egopose.models.placed_states import placed_states
 from egopose.pipeline.environment import build_env
 from egopose.pipeline.networks import build_networks
 
-MATERIAL = forecasting_material()
+MATERIAL = forecasting_dataset()
 WINDOWS = [ForecastWindow(0, 3, CONTEXT, 6), ForecastWindow(1, 8, CONTEXT, 6)]
 NOW = torch.tensor([7, 52])
 
@@ -26,7 +26,7 @@ NOW = torch.tensor([7, 52])
 @pytest.fixture(scope="module")
 def actor() -> Any:
     torch.manual_seed(0)
-    env = build_env(configuration(), MATERIAL, worlds=1)
+    env = build_env(configuration(), MATERIAL, num_envs=1)
     actor, _ = build_networks(configuration(), MATERIAL, env)
     for parameter in actor.parameters():
         parameter.data += 0.3 * torch.randn_like(parameter)
@@ -36,7 +36,7 @@ def actor() -> Any:
 def futures(actor: Any, samples: int = 1, horizon: int = 6, seed: int = 0, qpos: Any = None) -> Forecasts:
     pieces = [window for window in WINDOWS for _ in range(samples)]
     env = build_env(
-        configuration(), MATERIAL, worlds=len(pieces), fragments=pieces, whole_fragments=True, falls_end=False
+        configuration(), MATERIAL, num_envs=len(pieces), fragments=pieces, whole_fragments=True, falls_end=False
     )
     given = MATERIAL.reference["qpos"][NOW] if qpos is None else qpos
     try:
@@ -90,8 +90,8 @@ def test_physics_that_breaks_stands_still(actor: Any) -> None:
 
 
 def test_worlds_must_fit(actor: Any) -> None:
-    env = build_env(configuration(), MATERIAL, worlds=3)
-    with pytest.raises(ValueError, match="worlds"):
+    env = build_env(configuration(), MATERIAL, num_envs=3)
+    with pytest.raises(ValueError, match="num_envs"):
         forecast(env, actor, MATERIAL.reference["qpos"][NOW], MATERIAL.reference["qvel"][NOW])
 
 
@@ -104,7 +104,7 @@ def test_an_estimated_state_is_put_where_the_person_stands() -> None:
 
 
 def test_calibrated_bands_cover_held_out_truth() -> None:
-    """Futures drawn far too alike, and more so later: calibrated, 80 % means 80 %."""
+    """ReferenceForecasts drawn far too alike, and more so later: calibrated, 80 % means 80 %."""
     generator = np.random.default_rng(0)
     windows, drawn, frames, joints = 400, 30, 5, 8
     centre = generator.normal(size=(windows, 1, frames, joints))

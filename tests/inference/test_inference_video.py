@@ -19,7 +19,7 @@ from egopose.data.spans import Span
 from egopose.humanoid.config import HumanoidConfig, SimConfig
 from egopose.humanoid.model import build_humanoid
 from egopose.inference.video import estimate_video
-from egopose.inference.video_regression import seen_in, video_material
+from egopose.inference.video_regression import seen_in, video_dataset
 from egopose.models.regressor_settings import RegressorSettings
 from egopose.motion.io import read_motion
 from egopose.pipeline.run import build_run
@@ -48,7 +48,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
         "vision": group("vision", "light"),
         "regressor": group("regressor", "fast"),
         "model": {**group("model", "fast"), "hidden": [8]},
-        "collector": {**COLLECTOR, "worlds": 2},
+        "collector": {**COLLECTOR, "num_envs": 2},
         "algo": {**SETTINGS, "iterations": 1, "steps_per_iteration": 16},
         "training": {k: v for k, v in LOOP.items() if k not in ("iterations", "steps_per_iteration")},
     }
@@ -64,15 +64,15 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     RunCheckpoint(weights).save(folder / "regressor", metadata=metadata_of("regressor", size, 1, 0, 0.0))
     flow = np.zeros((FRAMES, 2, 32, 32), np.float16)
     seen = seen_in(humanoid, regressor.eval(), flow, config)
-    material, _ = video_material(humanoid, seen, "nothing")
-    made = build_run(config, folder, material)
+    dataset, _ = video_dataset(humanoid, seen, "nothing")
+    made = build_run(config, folder, dataset)
     made.save()
     made.collector.shutdown()
     return folder
 
 
 def settings(video: Path, checkpoint: Path, **changed: Any) -> dict[str, Any]:
-    failsafe = {"mode": "value", "kappa": 0.6, "fallen_height": 0.3}
+    failsafe = {"mode": "value", "reset_threshold": 0.6, "fallen_height": 0.3}
     values = {"which": "latest", "out": None, "offset": 0.0, "size": 64, "failsafe": failsafe}
     values |= {"causal": False, "lookahead": 10, "camera": {}}
     return {"video": str(video), "checkpoint": str(checkpoint), **values, **changed}

@@ -22,17 +22,17 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from egopose.core.torch_settings import torch_threads
 from egopose.data.windows import ForecastWindow
 from egopose.envs.mdp.observations import humanoid_state
-from egopose.envs.reference_forecasts import Futures
+from egopose.envs.reference_forecasts import ReferenceForecasts
 from egopose.envs.test_time import prepare_for_test
 from egopose.evaluation import forecast_run as forecast_evaluation
 from egopose.evaluation.forecast_run import ForecastSettings, forecast_windows_of
 from egopose.inference.forecaster import forecast
-from egopose.inference.planner import Planner, followed_futures
+from egopose.inference.planner import Planner, followed_forecasts
 from egopose.inference.planner_settings import PlannerSettings
 from egopose.pipeline.agent import Agent
 from egopose.pipeline.environment import build_env
 from egopose.pipeline.networks import build_networks
-from egopose.tasks.dataset import Material
+from egopose.tasks.dataset import Dataset
 
 WINDOWS = [ForecastWindow(0, 0, 5, 12), ForecastWindow(0, 9, 5, 12), ForecastWindow(0, 4, 5, 12)]
 TEST = {"whole_fragments": True, "falls_end": False}
@@ -47,47 +47,49 @@ def _one_thread_and_seed() -> Iterator[None]:
 
 
 @pytest.fixture(scope="module")
-def material() -> Material:
+def dataset() -> Dataset:
     """Whose forecasts are not what happens: each goes back from where it begins."""
     humanoid: Any = stand_in()
     reference, takes = reference_motion(humanoid)
-    made = Material(humanoid, reference, takes, PIECES, PIECES, states=humanoid_state(reference).float())
+    made = Dataset(humanoid, reference, takes, PIECES, PIECES, states=humanoid_state(reference).float())
     known = curves(made)
     coefficients = 2 * known.coefficients[:, :1] - known.coefficients
-    return replace(made, futures=Futures(coefficients, known.starts, known.frames, known.horizon, 3, FPS))
+    return replace(made, futures=ReferenceForecasts(coefficients, known.starts, known.frames, known.horizon, 3, FPS))
 
 
 @pytest.fixture(scope="module")
-def agent(material: Material) -> Agent:
+def agent(dataset: Dataset) -> Agent:
     config = configuration()
-    make_env = partial(build_env, config, material)
-    env = make_env(worlds=2, fragments=PIECES[:1])
-    actor, critic = build_networks(config, material, env)
+    make_env = partial(build_env, config, dataset)
+    env = make_env(num_envs=2, fragments=PIECES[:1])
+    actor, critic = build_networks(config, dataset, env)
     env.close()
-    return Agent(actor.eval(), critic.eval(), config, material, make_env, Path("nowhere"))
+    return Agent(actor.eval(), critic.eval(), config, dataset, make_env, Path("nowhere"))
 
 
 def nows(agent: Agent, windows: list[ForecastWindow]) -> Tensor:
-    return torch.tensor([int(agent.material.takes.offsets[w.take]) + w.now for w in windows])
+    return torch.tensor([int(agent.dataset.takes.offsets[w.take]) + w.now for w in windows])
 
 
 def begun(agent: Agent, windows: list[ForecastWindow]) -> tuple[Tensor, Tensor]:
-    now, futures = nows(agent, windows), agent.material.futures
+    now, futures = nows(agent, windows), agent.dataset.forecasts
     assert futures is not None
-    reference = torch.as_tensor(agent.material.reference["qpos"][now])
-    return futures.first_state(now, reference, np.asarray(agent.material.humanoid.joint_range))
+    reference = torch.as_tensor(agent.dataset.reference["qpos"][now])
+    return futures.first_state(now, reference, np.asarray(agent.dataset.humanoid.joint_range))
 
 
 def planner_for(agent: Agent, windows: list[ForecastWindow], **changed: Any) -> Planner:
     chosen = settings(**{**SMALL, **changed})
-    assert agent.material.futures is not None
-    env = agent.make_env(worlds=len(windows) * chosen.samples, fragments=windows, **TEST)
-    followed, row = followed_futures(agent.material.futures, nows(agent, windows))
+    assert agent.dataset.forecasts is not None
+    env = agent.make_env(num_envs=len(windows) * chosen.samples, fragments=windows, **TEST)
+    followed, row = followed_forecasts(agent.dataset.forecasts, nows(agent, windows))
     return Planner(env, agent.actor, agent.critic, followed, chosen, row)
 
 
 def forecast_of(agent: Agent, windows: list[ForecastWindow], samples: int = 1, planner: Any = None) -> Any:
-    env = agent.make_env(worlds=len(windows) * samples, fragments=[w for w in windows for _ in range(samples)], **TEST)
+    env = agent.make_env(
+        num_envs=len(windows) * samples, fragments=[w for w in windows for _ in range(samples)], **TEST
+    )
     made = forecast(env, agent.actor, *begun(agent, windows), samples, 12, 3, 0.0, planner)
     env.close()
     return made
@@ -96,12 +98,12 @@ def forecast_of(agent: Agent, windows: list[ForecastWindow], samples: int = 1, p
 # --- what is followed ------------------------------------------------------------------------------------------------
 
 
-def test_what_is_followed_is_every_step_of_every_curve(material: Material) -> None:
-    futures = material.futures
+def test_what_is_followed_is_every_step_of_every_curve(dataset: Dataset) -> None:
+    futures = dataset.forecasts
     assert futures is not None
     starts = torch.tensor([17, 3, 8])
-    states, row = followed_futures(futures, starts)
-    assert states.shape == (3 * 13, material.states.shape[1])
+    states, row = followed_forecasts(futures, starts)
+    assert states.shape == (3 * 13, dataset.states.shape[1])
     start, step = starts.repeat(20), torch.arange(20).repeat_interleave(3)
     rows = row({"episode_start": start[:, None], "episode_step": step[:, None], "frame": torch.zeros(60, 1).long()})
     assert rows.dtype == torch.int64
@@ -117,7 +119,7 @@ def test_what_is_followed_is_every_step_of_every_curve(material: Material) -> No
 
 def test_the_body_that_is_followed_is_the_curves_at_that_step(agent: Agent) -> None:
     """At each step of the plans made at 0, 4 and 8, for all copies; at the window's end the clock stops."""
-    futures, now = agent.material.futures, nows(agent, WINDOWS)
+    futures, now = agent.dataset.forecasts, nows(agent, WINDOWS)
     assert futures is not None
     planner = planner_for(agent, WINDOWS, every=4)
     reward, seen = planner._reward, list[tuple[SimpleNamespace, Tensor]]()
@@ -147,13 +149,13 @@ def test_the_body_that_is_followed_is_the_curves_at_that_step(agent: Agent) -> N
 
 def test_the_head_that_is_followed_is_as_high_as_the_curves(agent: Agent) -> None:
     """The heads of bodies placed by hand where the curve has them."""
-    futures = agent.material.futures
+    futures = agent.dataset.forecasts
     assert futures is not None
     planner = planner_for(agent, WINDOWS)
     now = nows(agent, WINDOWS)
-    env = agent.make_env(worlds=3, fragments=WINDOWS, **TEST)
+    env = agent.make_env(num_envs=3, fragments=WINDOWS, **TEST)
     env.reset()
-    base, head = env.base_env, agent.material.humanoid.head
+    base, head = env.base_env, agent.dataset.humanoid.head
     base.place(torch.arange(3), *begun(agent, WINDOWS))
     rows = planner._row({"episode_start": now[:, None], "episode_step": torch.zeros(3, 1).long()})
     torch.testing.assert_close(planner._head_height[rows], base.body_state()["xpos"][:, head, 2], atol=1e-4, rtol=0)
@@ -171,9 +173,9 @@ def test_looking_ahead_changes_a_forecast_and_the_policy_alone_is_what_it_was(ag
 
 
 @torch.no_grad()
-def by_hand(agent: Agent, windows: list[ForecastWindow], addition: float) -> np.ndarray:
+def by_hand(agent: Agent, windows: list[ForecastWindow], perturbation: float) -> np.ndarray:
     """``[W, 12, nq]``: the mean action and an addition to it, step by step."""
-    env = agent.make_env(worlds=len(windows), fragments=windows, **TEST)
+    env = agent.make_env(num_envs=len(windows), fragments=windows, **TEST)
     prepare_for_test(env, agent.actor)
     observation = env.reset()
     base = env.base_env
@@ -183,7 +185,7 @@ def by_hand(agent: Agent, windows: list[ForecastWindow], addition: float) -> np.
     with set_exploration_type(ExplorationType.DETERMINISTIC):
         for _ in range(12):
             observation = agent.actor(observation)
-            observation["action"] = observation["action"] + addition
+            observation["action"] = observation["action"] + perturbation
             observation = env.step(observation)["next"].exclude("reward", "action")
             rows.append(base.body_state()["qpos"].clone())
     env.close()
@@ -193,11 +195,11 @@ def by_hand(agent: Agent, windows: list[ForecastWindow], addition: float) -> np.
 def test_additions_are_to_the_mean_action_and_drawn_futures_know_none(agent: Agent) -> None:
     asked: list[int] = []
 
-    def addition(base: Any) -> Tensor:
+    def perturbation(base: Any) -> Tensor:
         asked.append(len(base.physics.qpos))
-        return torch.full((asked[-1], agent.material.humanoid.mj_model.nu), 0.05)
+        return torch.full((asked[-1], agent.dataset.humanoid.mj_model.nu), 0.05)
 
-    stub = SimpleNamespace(addition=addition)
+    stub = SimpleNamespace(perturbation=perturbation)
     pushed = forecast_of(agent, WINDOWS, planner=stub)
     assert asked == [3] * 12
     np.testing.assert_array_equal(pushed.qpos[:, 0], by_hand(agent, WINDOWS, 0.05))
@@ -229,15 +231,15 @@ def made(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
     return there
 
 
-def windows_by(agent: Agent, planner: PlannerSettings | None, worlds: int = 8, samples: int = 1) -> Any:
-    chosen = replace(FORECAST, worlds=worlds)
+def windows_by(agent: Agent, planner: PlannerSettings | None, num_envs: int = 8, samples: int = 1) -> Any:
+    chosen = replace(FORECAST, num_envs=num_envs)
     return forecast_windows_of(agent, WINDOWS, begun(agent, WINDOWS), samples, chosen, 1, planner)
 
 
 def test_each_lot_of_windows_has_a_planner_that_follows_its_curves(agent: Agent, made: list[Any]) -> None:
-    chosen, futures = settings(**SMALL), agent.material.futures
+    chosen, futures = settings(**SMALL), agent.dataset.forecasts
     assert futures is not None
-    told = windows_by(agent, chosen, worlds=2)
+    told = windows_by(agent, chosen, num_envs=2)
     assert [one.closed for one in made] == [True, True]
     now = nows(agent, WINDOWS)
     for one, part in zip(made, (now[:2], now[2:]), strict=True):
@@ -253,14 +255,14 @@ def test_each_lot_of_windows_has_a_planner_that_follows_its_curves(agent: Agent,
     planner = planner_for(agent, WINDOWS[:2])
     np.testing.assert_array_equal(told.qpos[:2], forecast_of(agent, WINDOWS[:2], planner=planner).qpos)
     planner.close()
-    assert np.abs(told.qpos - windows_by(agent, None, worlds=2).qpos).max() > 1e-3
+    assert np.abs(told.qpos - windows_by(agent, None, num_envs=2).qpos).max() > 1e-3
     assert len(made) == 2
 
 
 def test_without_settings_there_is_no_planner_and_lots_change_nothing(agent: Agent, made: list[Any]) -> None:
     alone = windows_by(agent, None)
     np.testing.assert_array_equal(alone.qpos, forecast_of(agent, WINDOWS).qpos)
-    np.testing.assert_allclose(windows_by(agent, None, worlds=1).qpos, alone.qpos, atol=1e-6)
+    np.testing.assert_allclose(windows_by(agent, None, num_envs=1).qpos, alone.qpos, atol=1e-6)
     drawn = windows_by(agent, None, samples=2)
     np.testing.assert_array_equal(drawn.qpos, forecast_of(agent, WINDOWS, samples=2).qpos)
     assert not made
@@ -276,7 +278,7 @@ def test_an_agent_that_follows_no_forecast_does_not_look_ahead(
         return SimpleNamespace(qpos=qpos.numpy(), fallen=qpos.numpy(), diverged=qpos.numpy())
 
     monkeypatch.setattr(forecast_evaluation, "forecast", told)
-    blind = replace(agent, material=replace(agent.material, futures=None))
+    blind = replace(agent, dataset=replace(agent.dataset, forecasts=None))
     states = begun(agent, WINDOWS)
     for one, planners in ((blind, 0), (agent, 1)):
         forecast_windows_of(one, WINDOWS, states, 1, FORECAST, 1, settings(**SMALL))

@@ -19,7 +19,7 @@ from torchrl.envs import Compose, TransformedEnv
 
 from egopose.core.config import compose_config
 from egopose.core.errors import InputError
-from egopose.core.torch_settings import prefer_quick_products
+from egopose.core.torch_settings import enable_onednn_matmul
 from egopose.envs.build import build_problem
 from egopose.envs.env import EgoPoseEnv
 from egopose.envs.forecasting_transforms import RecurrentStates
@@ -39,12 +39,12 @@ PIECES = (Piece(0, 0, FRAMES), Piece(1, 0, FRAMES))
 SMALL = {
     "samples": 12,
     "rounds": 1,
-    "near": 0.0,
+    "tie_tolerance": 0.0,
     "horizon": 8,
     "every": 8,
-    "knot": 3,
+    "knot_spacing": 3,
     "acceleration": 0.001,
-    "rescue": 0,
+    "recovery_rounds": 0,
 }
 humanoid = cache(stand_in)
 
@@ -71,13 +71,13 @@ def states_of(reference: TensorDict) -> Tensor:
     return humanoid_state(reference).float()
 
 
-def make_env(worlds: int, reference: TensorDict | None = None, threads: int = 1, **action: Any) -> TransformedEnv:
+def make_env(num_envs: int, reference: TensorDict | None = None, threads: int = 1, **action: Any) -> TransformedEnv:
     known, takes = true_motion()
     task = group("task", "estimation")
     task = task | {"termination": {"enabled": False, "head_drop": 0.1}, "action": task["action"] | action}
     body: StandIn = humanoid()
     problem = build_problem(body, known if reference is None else reference, takes, task, group("reward", "estimation"))
-    base = environment(worlds, problem=problem, fragments=PIECES, whole_fragments=True, threads=threads)
+    base = environment(num_envs, problem=problem, fragments=PIECES, whole_fragments=True, threads=threads)
     return TransformedEnv(base, Compose(StateNormalizer(base.observation_spec["humanoid_state"].shape[-1])))
 
 
@@ -107,14 +107,14 @@ def critic() -> TensorDictModule:
 
 
 def planner_for(
-    worlds: int,
+    num_envs: int,
     states: Tensor,
     policy: TensorDictModule | None = None,
     env: dict[str, Any] | None = None,
     **changed: Any,
 ) -> Planner:
     chosen = settings(**{**SMALL, **changed})
-    copies = frozen(make_env(worlds * chosen.samples, **(env or {})))
+    copies = frozen(make_env(num_envs * chosen.samples, **(env or {})))
     return Planner(copies, policy or actor(), critic(), states, chosen)
 
 
@@ -137,7 +137,7 @@ def simulated(base: EgoPoseEnv, way: Tensor, followed: TensorDict, chosen: Plann
     env.reset()
     here = base_of(env)
     here.load_state_dict(base.state_dict())
-    observation, worth, cost = env.transform(here.observe()), 0.0, 0.0
+    observation, returns, cost = env.transform(here.observe()), 0.0, 0.0
     for step in range(way.shape[1]):
         before = here.body_state()["qvel"]
         observation = actor()(observation)
@@ -147,29 +147,29 @@ def simulated(base: EgoPoseEnv, way: Tensor, followed: TensorDict, chosen: Plann
         head = humanoid().head
         low = (followed["xpos"][frame, head, 2] - body["xpos"][:, head, 2]).clamp(min=0)
         change = 30.0 * (body["qvel"] - before).abs().mean(1)
-        worth = worth + chosen.discount**step * after["reward"].squeeze(-1)
+        returns = returns + chosen.discount**step * after["reward"].squeeze(-1)
         cost = cost + chosen.discount**step * (chosen.acceleration * change + chosen.head * low)
         observation = after.exclude("reward", "action")
-    worth = worth + chosen.discount ** way.shape[1] * critic()(observation)["state_value"].squeeze(-1)
+    returns = returns + chosen.discount ** way.shape[1] * critic()(observation)["state_value"].squeeze(-1)
     env.close()
-    return worth, worth - cost
+    return returns, returns - cost
 
 
 def whole_way(planner: Planner, base: EgoPoseEnv) -> Tensor:
     """The way that was chosen, ``[N, H, nu]``: a planner that plans once in a horizon gives it out step by step."""
     assert planner.settings.every == planner.settings.horizon
-    return torch.stack([planner.addition(base) for _ in range(planner.settings.horizon)], dim=1)
+    return torch.stack([planner.perturbation(base) for _ in range(planner.settings.horizon)], dim=1)
 
 
 def run(planner: Planner | None, states: Tensor, policy: TensorDictModule) -> list[Estimate]:
-    guard = FailSafe(len(PIECES), FailSafeSettings("off", kappa=0.6, fallen_height=0.3))
+    guard = FailSafe(len(PIECES), FailSafeSettings("off", reset_threshold=0.6, fallen_height=0.3))
     return estimate_takes(make_env(len(PIECES)), policy, critic(), states, guard, planner=planner)
 
 
 def test_a_body_that_falls_alone_stays_up_longer() -> None:
     states = states_of(true_motion()[0])
     alone = run(None, states, passive())
-    planner = planner_for(2, states, passive(), samples=32, horizon=16, every=4, knot=5)
+    planner = planner_for(2, states, passive(), samples=32, horizon=16, every=4, knot_spacing=5)
     ahead = run(planner, states, passive())
     for one, other in zip(alone, ahead, strict=True):
         np.testing.assert_array_equal(one.qpos[0], other.qpos[0])
@@ -183,8 +183,8 @@ def test_the_value_is_what_a_plain_simulation_of_the_chosen_way_is_worth(rounds:
     followed = other_motion()
     base = leaning(make_env(2))
     planner = planner_for(2, states_of(followed), rounds=rounds)
-    worth, score = simulated(base, whole_way(planner, base), followed, planner.settings)
-    torch.testing.assert_close(planner.value, worth.float(), rtol=0, atol=1e-4)
+    returns, score = simulated(base, whole_way(planner, base), followed, planner.settings)
+    torch.testing.assert_close(planner.value, returns.float(), rtol=0, atol=1e-4)
     nothing = torch.zeros(2, planner.settings.horizon, humanoid().mj_model.nu)
     policy_alone = simulated(base, nothing, followed, planner.settings)
     assert (score >= policy_alone[1] - 1e-4).all()
@@ -201,12 +201,12 @@ def test_a_body_that_lies_where_it_should_stand_is_worth_nothing() -> None:
     qpos[1, 2] -= 0.35
     base.place(torch.arange(3), qpos, body["qvel"])
     for planner in (plain, lost):
-        planner.addition(base)
+        planner.perturbation(base)
     assert (plain.value != 0).all()
     torch.testing.assert_close(lost.value[[0, 2]], plain.value[[0, 2]])
     assert lost.value[1] == 0
     base.place(torch.arange(3), body["qpos"], body["qvel"])
-    lost.addition(base)
+    lost.perturbation(base)
     assert lost.value[1] != 0, "a body that has got up again is worth its plan"
 
 
@@ -218,8 +218,8 @@ def test_without_a_better_way_the_policy_goes_on_alone() -> None:
     planner._plan[:, ::2] = 2.0  # and the plan so far shakes most
     assert not whole_way(planner, base).any()
     nothing = torch.zeros(2, planner.settings.horizon, humanoid().mj_model.nu)
-    worth, _ = simulated(base, nothing, followed, planner.settings)
-    torch.testing.assert_close(planner.value, worth.float(), rtol=0, atol=1e-4)
+    returns, _ = simulated(base, nothing, followed, planner.settings)
+    torch.testing.assert_close(planner.value, returns.float(), rtol=0, atol=1e-4)
 
 
 def test_small_gains_change_nothing() -> None:
@@ -239,7 +239,7 @@ def test_small_gains_change_nothing() -> None:
 
 def test_only_what_balances_is_added_to_and_smoothly() -> None:
     base = leaning(make_env(2))
-    planner = planner_for(2, states_of(true_motion()[0]), joints=["Leg"], knot=4, horizon=9, every=9, rounds=3)
+    planner = planner_for(2, states_of(true_motion()[0]), joints=["Leg"], knot_spacing=4, horizon=9, every=9, rounds=3)
     way = whole_way(planner, base)
     names = [joint.name for joint in humanoid().skeleton.joints for _ in joint.dofs]
     legs = torch.tensor(["Leg" in name for name in names])
@@ -255,7 +255,7 @@ def test_planning_touches_nothing_of_the_body_it_is_for() -> None:
     base = leaning(make_env(2))
     planner = planner_for(2, states_of(other_motion()), rounds=2)
     before = {name: value.clone() for name, value in base.state_dict().items()}
-    planner.addition(base)
+    planner.perturbation(base)
     after = base.state_dict()
     assert before.keys() == after.keys()
     assert all(torch.equal(value, after[name]) for name, value in before.items())
@@ -276,13 +276,13 @@ def test_the_same_seed_gives_the_same_estimate_whatever_the_threads() -> None:
 def test_the_true_motion_plays_no_part() -> None:
     true, states = true_motion()[0], states_of(other_motion())
     altered = torch.cat([torch.cat([take[:1], take[1:].flip(0)]) for take in true.split(FRAMES)])
-    additions = []
+    perturbations = []
     for reference in (true, altered):
         base = leaning(make_env(2, reference))
         planner = planner_for(2, states, env={"reference": reference}, rounds=2)
-        additions.append((whole_way(planner, base), planner.value))
+        perturbations.append((whole_way(planner, base), planner.value))
     assert not torch.equal(true["qpos"], altered["qpos"])
-    for one, two in zip(*additions, strict=True):
+    for one, two in zip(*perturbations, strict=True):
         assert torch.equal(one, two)
 
 
@@ -290,18 +290,18 @@ def test_a_body_that_was_placed_elsewhere_is_planned_for_at_once() -> None:
     followed = other_motion()
     states, base = states_of(followed), leaning(make_env(2))
     planner = planner_for(2, states)
-    first = planner.addition(base)
+    first = planner.perturbation(base)
     value = planner.value.clone()
     moved = base.body_state()["qpos"]
     moved[:, 9] += 0.4
     base.place(torch.arange(2), moved, torch.zeros(2, humanoid().mj_model.nv, dtype=torch.float64))
-    planner.addition(base)
+    planner.perturbation(base)
     assert torch.equal(planner.value, value)  # the plan goes on
     planner.forget(torch.tensor([0, 1]))
     way = whole_way(planner, base)
     assert not torch.equal(way[:, 0], first)
-    worth, _ = simulated(base, way, followed, planner.settings)
-    torch.testing.assert_close(planner.value, worth.float(), rtol=0, atol=1e-4)
+    returns, _ = simulated(base, way, followed, planner.settings)
+    torch.testing.assert_close(planner.value, returns.float(), rtol=0, atol=1e-4)
 
 
 def test_a_restart_by_the_fail_safe_is_planned_for() -> None:
@@ -311,7 +311,7 @@ def test_a_restart_by_the_fail_safe_is_planned_for() -> None:
     told: list[list[int]] = []
     forget = planner.forget
     planner.forget = lambda worlds: (told.append(worlds.tolist()), forget(worlds))[1]  # type: ignore[method-assign]
-    guard = FailSafe(2, FailSafeSettings("naive", kappa=0.6, fallen_height=1.4))  # higher than any head here
+    guard = FailSafe(2, FailSafeSettings("naive", reset_threshold=0.6, fallen_height=1.4))  # higher than any head here
     estimates = estimate_takes(make_env(2), actor(), critic(), states, guard, planner=planner)
     resets = [np.flatnonzero(one.resets) for one in estimates]
     assert len(resets[0])
@@ -329,10 +329,10 @@ def tries_of(planner: Planner) -> list[tuple[Tensor, Tensor]]:
     tries: list[tuple[Tensor, Tensor]] = []
     tried = planner._tried
 
-    def spied(now: Any, ways: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        score, worth, low = tried(now, ways)
-        tries.append((ways.clone(), score.clone()))
-        return score, worth, low
+    def spied(now: Any, candidates: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        score, returns, low = tried(now, candidates)
+        tries.append((candidates.clone(), score.clone()))
+        return score, returns, low
 
     planner._tried = spied  # type: ignore[method-assign]
     return tries
@@ -346,37 +346,37 @@ def some_plan(planner: Planner, size: float = 0.05) -> Tensor:
     return plan[:, : planner.settings.horizon].clone()
 
 
-def taken(score: Tensor, ways: Tensor, chosen: PlannerSettings) -> list[int]:
+def taken(score: Tensor, candidates: Tensor, chosen: PlannerSettings) -> list[int]:
     """The way for each body by the words of the settings: none, the plan so far, or the one near the best that changes
     least."""
     out = []
     for body, points in enumerate(score.T.tolist()):
-        change = [float((way[body] - ways[1, body]).square().mean()) for way in ways]
-        near = [k for k, point in enumerate(points) if point >= max(points) - chosen.near]
+        change = [float((way[body] - candidates[1, body]).square().mean()) for way in candidates]
+        tie_tolerance = [k for k, point in enumerate(points) if point >= max(points) - chosen.tie_tolerance]
         first = [k for k in (0, 1) if points[k] >= max(points) - chosen.margin]
-        out.append(first[0] if first else min(near, key=lambda k: change[k]))
+        out.append(first[0] if first else min(tie_tolerance, key=lambda k: change[k]))
     return out
 
 
 def test_every_round_is_judged_as_a_plain_simulation_does_and_the_one_near_the_best_is_taken() -> None:
     followed, base = other_motion(), leaning(make_env(2))
-    for near in (0.0, 0.15):
-        planner = planner_for(2, states_of(followed), samples=5, rounds=3, near=near, margin=0.0)
+    for tie_tolerance in (0.0, 0.15):
+        planner = planner_for(2, states_of(followed), samples=5, rounds=3, tie_tolerance=tie_tolerance, margin=0.0)
         some_plan(planner, 0.3)
         tries = tries_of(planner)
         way = whole_way(planner, base)
-        assert [len(ways) for ways, _ in tries] == [5, 5, 5]
-        ways = torch.cat([ways for ways, _ in tries])
-        worth, score = (
+        assert [len(candidates) for candidates, _ in tries] == [5, 5, 5]
+        candidates = torch.cat([candidates for candidates, _ in tries])
+        returns, score = (
             torch.stack(values)
-            for values in zip(*(simulated(base, one, followed, planner.settings) for one in ways), strict=True)
+            for values in zip(*(simulated(base, one, followed, planner.settings) for one in candidates), strict=True)
         )
         torch.testing.assert_close(torch.cat([one for _, one in tries]), score.float(), rtol=0, atol=1e-4)
-        best = taken(score, ways, planner.settings)
-        assert torch.equal(way, ways[best, [0, 1]])
-        torch.testing.assert_close(planner.value, worth[best, [0, 1]].float(), rtol=0, atol=1e-4)
-        assert (score[best, [0, 1]] >= score[:5].amax(0) - near - 1e-4).all()
-        if near:
+        best = taken(score, candidates, planner.settings)
+        assert torch.equal(way, candidates[best, [0, 1]])
+        torch.testing.assert_close(planner.value, returns[best, [0, 1]].float(), rtol=0, atol=1e-4)
+        assert (score[best, [0, 1]] >= score[:5].amax(0) - tie_tolerance - 1e-4).all()
+        if tie_tolerance:
             assert (score[best, [0, 1]] < score.amax(0) - 1e-3).any(), "or near changes nothing here"
 
 
@@ -395,7 +395,7 @@ def test_more_rounds_from_the_same_state_and_seed_find_no_worse_way_and_some_bet
 
 def test_with_all_ways_near_the_plan_so_far_is_kept_unless_none_is_within_the_margin() -> None:
     followed, base = other_motion(), leaning(make_env(2))
-    planner = planner_for(2, states_of(followed), samples=6, rounds=3, near=1e6, margin=0.0)
+    planner = planner_for(2, states_of(followed), samples=6, rounds=3, tie_tolerance=1e6, margin=0.0)
     plan, tries = some_plan(planner), tries_of(planner)
     kept = whole_way(planner, base)
     assert plan.any()
@@ -403,29 +403,33 @@ def test_with_all_ways_near_the_plan_so_far_is_kept_unless_none_is_within_the_ma
     assert (score[0] < score.amax(0)).all()
     assert (score[1] < score.amax(0)).all()
     assert torch.equal(kept, plan)
-    wide = planner_for(2, states_of(followed), samples=6, rounds=3, near=1e6, margin=1e5)
+    wide = planner_for(2, states_of(followed), samples=6, rounds=3, tie_tolerance=1e6, margin=1e5)
     some_plan(wide)
     assert not whole_way(wide, base).any()
 
 
-@pytest.mark.parametrize(("near", "margin"), [(0.0, 0.0), (0.5, 0.0), (0.5, 0.2), (0.1, 0.3), (0.0, 0.2)])
-def test_of_any_scores_none_and_the_plan_so_far_come_first_within_the_margin(near: float, margin: float) -> None:
+@pytest.mark.parametrize(("tie_tolerance", "margin"), [(0.0, 0.0), (0.5, 0.0), (0.5, 0.2), (0.1, 0.3), (0.0, 0.2)])
+def test_of_any_scores_none_and_the_plan_so_far_come_first_within_the_margin(
+    tie_tolerance: float, margin: float
+) -> None:
     bodies, base = 40, SimpleNamespace(state_dict=dict)
-    planner = planner_for(bodies, states_of(true_motion()[0]), samples=4, rounds=3, near=near, margin=margin)
+    planner = planner_for(
+        bodies, states_of(true_motion()[0]), samples=4, rounds=3, tie_tolerance=tie_tolerance, margin=margin
+    )
     plan, seen, points = some_plan(planner), list[Tensor](), list[Tensor]()
 
-    def scored(now: Any, ways: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        seen.append(ways.clone())
-        points.append(torch.rand(ways.shape[:2], generator=torch.Generator().manual_seed(len(points))))
+    def scored(now: Any, candidates: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        seen.append(candidates.clone())
+        points.append(torch.rand(candidates.shape[:2], generator=torch.Generator().manual_seed(len(points))))
         return points[-1], 10 + points[-1], 0 * points[-1]
 
     planner._tried = scored  # type: ignore[method-assign]
     planner._look_ahead(base)  # type: ignore[arg-type]
-    ways, score = torch.cat(seen), torch.cat(points)
-    assert torch.equal(ways[1], plan)
-    best, worlds = taken(score, ways, planner.settings), torch.arange(bodies)
-    assert torch.equal(planner._plan[:, : planner.settings.horizon], ways[best, worlds])
-    assert torch.equal(planner._worth, 10 + score[best, worlds])
+    candidates, score = torch.cat(seen), torch.cat(points)
+    assert torch.equal(candidates[1], plan)
+    best, worlds = taken(score, candidates, planner.settings), torch.arange(bodies)
+    assert torch.equal(planner._plan[:, : planner.settings.horizon], candidates[best, worlds])
+    assert torch.equal(planner._returns, 10 + score[best, worlds])
     # All that can be taken is: the two that come first, and ways of every round.
     assert len({k // 4 for k in best}) == 3
     assert {0, 1} <= set(best)
@@ -435,18 +439,18 @@ def test_of_any_scores_none_and_the_plan_so_far_come_first_within_the_margin(nea
 def judged(count: int, bodies: int, plan: Tensor) -> tuple[Tensor, Tensor]:
     """Ways drawn at random, the second the plan so far, and scores of which no body's best are another's."""
     generator = torch.Generator().manual_seed(count)
-    ways = torch.randn(count, *plan.shape, generator=generator)
-    ways[1] = plan
-    return ways, torch.stack([torch.randperm(count, generator=generator).float() for _ in range(bodies)], dim=1)
+    candidates = torch.randn(count, *plan.shape, generator=generator)
+    candidates[1] = plan
+    return candidates, torch.stack([torch.randperm(count, generator=generator).float() for _ in range(bodies)], dim=1)
 
 
-def between(ways: Tensor, score: Tensor, body: int) -> list[Tensor]:
+def between(candidates: Tensor, score: Tensor, body: int) -> list[Tensor]:
     """What a later round tries of a body's ways ``[K, H, nu]`` whatever chance says, by the method's words."""
-    order = sorted(range(len(ways)), key=lambda k: -float(score[k, body]))
-    best, plan, nothing = ways[order[0], body], ways[1, body], torch.zeros_like(ways[1, body])
+    order = sorted(range(len(candidates)), key=lambda k: -float(score[k, body]))
+    best, plan, nothing = candidates[order[0], body], candidates[1, body], torch.zeros_like(candidates[1, body])
     out = [other + part * (best - other) for part in (0.25, 0.5, 0.75) for other in (plan, nothing)]
     for count in (2, 4, 8):
-        mean = ways[order[:count], body].mean(0)
+        mean = candidates[order[:count], body].mean(0)
         out += [mean, 0.5 * mean, (plan + mean) / 2]
     return out
 
@@ -459,24 +463,24 @@ def holds(rows: Tensor, wanted: Tensor) -> bool:
 def test_a_later_round_tries_what_lies_between_and_about_the_best(samples: int, known: int) -> None:
     """Fewer samples than ways between: some of these; more: the rest, about the mean of the best four."""
     planner = planner_for(2, states_of(true_motion()[0]), samples=samples)
-    ways, score = judged(known, 2, some_plan(planner))
+    candidates, score = judged(known, 2, some_plan(planner))
     start = planner._generator.get_state()
-    more = planner._refined(ways, score)
-    assert more.shape == (samples, *ways.shape[1:])
+    more = planner._refined(candidates, score)
+    assert more.shape == (samples, *candidates.shape[1:])
     planner._generator.set_state(start)
-    drawn = planner._additions(max(samples - 15, 0))
+    drawn = planner._perturbations(max(samples - 15, 0))
     for body in range(2):
-        wanted = between(ways, score, body)
+        wanted = between(candidates, score, body)
         if samples >= len(wanted):
             assert all(holds(more[:, body], one) for one in wanted)
         else:
             assert all(holds(torch.stack(wanted), one) for one in more[:, body])
-        for row, addition in zip(more[15:, body], drawn[:, body], strict=True):
-            torch.testing.assert_close(row, wanted[9] + 0.5 * addition)
+        for row, perturbation in zip(more[15:, body], drawn[:, body], strict=True):
+            torch.testing.assert_close(row, wanted[9] + 0.5 * perturbation)
     # A change of one body's scores is a change of its ways alone.
     score[:, 1] = score[:, 1].flip(0)
     planner._generator.set_state(start)
-    again = planner._refined(ways, score)
+    again = planner._refined(candidates, score)
     assert torch.equal(again[:, 0], more[:, 0])
     assert not torch.equal(again[:, 1], more[:, 1])
 
@@ -487,18 +491,18 @@ def test_a_later_round_tries_what_lies_between_and_about_the_best(samples: int, 
         ({"samples": 2}, "samples"),
         ({"rounds": 0}, "rounds"),
         ({"rounds": 1.5}, "rounds"),
-        ({"rescue": -1}, "rescue"),
+        ({"recovery_rounds": -1}, "recovery_rounds"),
         ({"horizon": 1}, "every"),
         ({"every": 0}, "every"),
-        ({"knot": 0}, "knot"),
+        ({"knot_spacing": 0}, "knot_spacing"),
         ({"deviation": 0.0}, "deviation"),
         ({"lost": 0.0}, "lost"),
-        ({"sinking": 0.0}, "sinking"),
+        ({"height_drop": 0.0}, "height_drop"),
         ({"wider": 0.0}, "wider"),
         ({"acceleration": -1.0}, "acceleration"),
         ({"head": -1.0}, "head"),
         ({"margin": -1.0}, "margin"),
-        ({"near": -0.1}, "near"),
+        ({"tie_tolerance": -0.1}, "tie_tolerance"),
         ({"discount": 0.0}, "discount"),
         ({"discount": 1.1}, "discount"),
         ({"reward": None}, "reward"),
@@ -529,22 +533,22 @@ def test_what_cannot_be_planned_for_is_refused() -> None:
 def estimated_by(planner: PlannerSettings | None, made: Callable[[], None] = lambda: None) -> list[Estimate]:
     """What an evaluation makes of both takes; ``made`` is called when it makes an environment."""
 
-    def env_of(split: str, *, worlds: int, threads: int, fragments: Any, **options: bool) -> TransformedEnv:
+    def env_of(split: str, *, num_envs: int, threads: int, fragments: Any, **options: bool) -> TransformedEnv:
         made()
         assert options == {"whole_fragments": True, "falls_end": False}
         assert list(fragments) == list(PIECES)
-        return frozen(make_env(worlds, threads=threads))
+        return frozen(make_env(num_envs, threads=threads))
 
     states = states_of(other_motion())
     agent: Any = SimpleNamespace(
         make_env=env_of,
-        material=SimpleNamespace(test=PIECES),
+        dataset=SimpleNamespace(test=PIECES),
         actor=actor(),
         critic=critic(),
         followed_states=lambda: states,
         config={"algo": {"gamma": 0.99}},
     )
-    failsafe = FailSafeSettings("off", kappa=0.6, fallen_height=0.3)
+    failsafe = FailSafeSettings("off", reset_threshold=0.6, fallen_height=0.3)
     return estimate_and_judge(agent, 2, "test", failsafe, 1, None, planner)[0]
 
 
@@ -570,7 +574,7 @@ def test_an_evaluation_has_the_same_threads_whatever_the_process_did_before(befo
         assert torch.get_num_threads() == before
     finally:
         torch.set_num_threads(usual)
-    assert found == [(1, "bf16" if prefer_quick_products() else "none")]
+    assert found == [(1, "bf16" if enable_onednn_matmul() else "none")]
 
 
 def test_estimates_plan_unless_they_are_causal_or_told_not_to() -> None:
@@ -592,12 +596,12 @@ def sinking_tries(planner: Planner, lows: list[list[float]]) -> list[Tensor]:
     """Ways tried, a round at a time; the best of each round is its last, better than any before, and ends that low."""
     tried: list[Tensor] = []
 
-    def told(now: Any, ways: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def told(now: Any, candidates: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         number = len(tried)
-        tried.append(ways.clone())
-        score = torch.full(ways.shape[:2], -100.0)
+        tried.append(candidates.clone())
+        score = torch.full(candidates.shape[:2], -100.0)
         score[-1] = float(number)
-        low = torch.full(ways.shape[:2], 5.0)
+        low = torch.full(candidates.shape[:2], 5.0)
         low[-1] = torch.tensor(lows[min(number, len(lows) - 1)])
         return score, score, low
 
@@ -615,27 +619,27 @@ def sinking_tries(planner: Planner, lows: list[list[float]]) -> list[Tensor]:
     ],
 )
 def test_further_rounds_are_tried_as_long_as_a_body_sinks_in_its_best_way(lows: list[list[float]], rounds: int) -> None:
-    changes: dict[str, Any] = {"samples": 20, "rounds": 2, "rescue": 3, "sinking": 0.2, "wider": 4.0}
+    changes: dict[str, Any] = {"samples": 20, "rounds": 2, "recovery_rounds": 3, "height_drop": 0.2, "wider": 4.0}
     planner = planner_for(2, states_of(true_motion()[0]), **changes)
     tried = sinking_tries(planner, lows)
     planner._look_ahead(SimpleNamespace(state_dict=dict))  # type: ignore[arg-type]
-    assert [len(ways) for ways in tried] == [20] * rounds
+    assert [len(candidates) for candidates in tried] == [20] * rounds
     best = tried[-1][-1]
     assert torch.equal(planner._plan[:, : planner.settings.horizon], best)
 
 
 def test_what_is_drawn_to_rescue_is_wider_and_by_turns_anew_and_about_the_best() -> None:
-    changes: dict[str, Any] = {"samples": 40, "rounds": 1, "rescue": 2, "wider": 4.0}
+    changes: dict[str, Any] = {"samples": 40, "rounds": 1, "recovery_rounds": 2, "wider": 4.0}
     planner = planner_for(2, states_of(true_motion()[0]), **changes)
     tried = sinking_tries(planner, [[1.0, 1.0]])
     planner._look_ahead(SimpleNamespace(state_dict=dict))  # type: ignore[arg-type]
     usual, anew, about = tried
-    spread = [float(ways[2:].square().mean().sqrt()) for ways in (usual, anew)]
+    spread = [float(candidates[2:].square().mean().sqrt()) for candidates in (usual, anew)]
     assert 3.0 < spread[1] / spread[0] < 5.0
     # The mean of the four best is the same for all that is drawn about it; that is half as wide as what is drawn anew.
-    ways, score = torch.cat([usual, anew]), torch.full((80, 2), -100.0)
+    candidates, score = torch.cat([usual, anew]), torch.full((80, 2), -100.0)
     score[39], score[79] = 0.0, 1.0
-    fixed = planner._refined(ways, score)[:15]
+    fixed = planner._refined(candidates, score)[:15]
     torch.testing.assert_close(about[:6], fixed[:6])
     size = float((about[15:] - about[15:].mean(0)).square().mean().sqrt())
     assert 0.35 < size / spread[1] < 0.65
@@ -644,8 +648,8 @@ def test_what_is_drawn_to_rescue_is_wider_and_by_turns_anew_and_about_the_best()
 def test_the_head_is_as_low_as_a_plain_simulation_ends() -> None:
     followed, base = true_motion()[0], leaning(make_env(2))
     planner = planner_for(2, states_of(followed))
-    ways = planner._additions(planner.settings.samples, 3.0)
-    low = planner._tried(base.state_dict(), ways)[2]
+    candidates = planner._perturbations(planner.settings.samples, 3.0)
+    low = planner._tried(base.state_dict(), candidates)[2]
     env = frozen(make_env(2, followed))
     env.reset()
     here = base_of(env)
@@ -653,7 +657,7 @@ def test_the_head_is_as_low_as_a_plain_simulation_ends() -> None:
     observation = env.transform(here.observe())
     for step in range(planner.settings.horizon):
         observation = actor()(observation)
-        observation["action"] = observation["action"] + ways[5, :, step]
+        observation["action"] = observation["action"] + candidates[5, :, step]
         observation = env.step(observation)["next"].exclude("reward", "action")
     head, frame = humanoid().head, observation["frame"].squeeze(-1)
     expected = (followed["xpos"][frame, head, 2] - here.body_state()["xpos"][:, head, 2]).clamp(min=0)

@@ -25,7 +25,7 @@ from egopose.inference.failsafe import FailSafe, FailSafeSettings
 from egopose.inference.stream.build import Trained, build_loop, source_settings, stream
 from egopose.inference.stream.live_body import LiveBody, LivePose
 from egopose.inference.video import estimate_video
-from egopose.inference.video_regression import causal_regression, seen_live, video_material
+from egopose.inference.video_regression import causal_regression, seen_live, video_dataset
 from egopose.motion.io import read_motion
 from egopose.pipeline.environment import build_env
 from egopose.vision.features import extract_flow
@@ -49,7 +49,7 @@ def walk(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def flow_of(trained: Trained, video: Path) -> np.ndarray:
-    return extract_flow(video, trained.made_with["vision"]["flow"])
+    return extract_flow(video, trained.source_config["vision"]["flow"])
 
 
 @pytest.mark.parametrize("smoothing", [0.0, 2.0])
@@ -87,25 +87,25 @@ def test_a_frame_is_seen_with_its_look_ahead_and_no_more(smoothing: float) -> No
 def test_the_body_moves_as_offline(walk: Path, model: str, task: str, cross_fit: int, smoothing: float) -> None:
     trained = untrained(model, task, cross_fit, smoothing)
     causal = causal_regression(
-        trained.humanoid, trained.regressor, trained.made_with, trained.config["task"], LOOKAHEAD
+        trained.humanoid, trained.regressor, trained.source_config, trained.config["task"], LOOKAHEAD
     )
-    seen = seen_live(causal, trained.regressor, flow_of(trained, walk), trained.made_with)
-    material, _ = video_material(trained.humanoid, seen, "walk")
+    seen = seen_live(causal, trained.regressor, flow_of(trained, walk), trained.source_config)
+    dataset, _ = video_dataset(trained.humanoid, seen, "walk")
     action = {**trained.config["task"]["action"], "smoothing": 0.0}
     config = {**trained.config, "task": {**trained.config["task"], "action": action}}
     # Values about 1 that any small drop makes unstable: the body is reset now and then.
     guard = FailSafeSettings("value", 0.999, 0.3)
     with torch.no_grad():
         [part for part in trained.critic.modules() if isinstance(part, nn.Linear)][-1].bias.fill_(1.0)
-    env = build_env(config, material, "test", worlds=1, whole_fragments=True, falls_end=False)
+    env = build_env(config, dataset, "test", num_envs=1, whole_fragments=True, falls_end=False)
     # The live environment has met nothing else than the offline one: both normalise by what they were trained with.
     env.transform.load_state_dict(trained.env.transform.state_dict())
     for network in (trained.actor, trained.critic):
         for part in network.modules():
             if hasattr(part, "features_table"):
-                part.features_table, part.take_bounds = material.visual_features, torch.tensor([[0, FRAMES]])
+                part.features_table, part.take_bounds = dataset.visual_features, torch.tensor([[0, FRAMES]])
     (offline,) = estimate_takes(
-        env, trained.actor, trained.critic, material.states, FailSafe(1, guard), lookahead=LOOKAHEAD
+        env, trained.actor, trained.critic, dataset.states, FailSafe(1, guard), lookahead=LOOKAHEAD
     )
 
     body = LiveBody(trained.env, trained.actor, trained.critic, guard)
@@ -156,9 +156,9 @@ def test_features_and_what_is_seen_are_the_offline_ones(walk: Path) -> None:
     poses: list[LivePose] = []
     loop.run(lambda pose, delay: poses.append(pose), lambda status: None)
     causal = causal_regression(
-        trained.humanoid, trained.regressor, trained.made_with, trained.config["task"], LOOKAHEAD
+        trained.humanoid, trained.regressor, trained.source_config, trained.config["task"], LOOKAHEAD
     )
-    offline = seen_live(causal, trained.regressor, flow_of(trained, walk), trained.made_with)
+    offline = seen_live(causal, trained.regressor, flow_of(trained, walk), trained.source_config)
     assert len(rows) == len(poses) == FRAMES
     assert not regression.pending
     np.testing.assert_allclose(torch.stack([r.window[0] for r in rows]), offline["visual_features"], atol=1e-5)

@@ -23,7 +23,7 @@ from egopose.checkpoint.checkpoint import ComponentState, RunCheckpoint, metadat
 from egopose.core.config import compose_config
 from egopose.core.errors import InputError
 from egopose.core.torch_settings import torch_threads
-from egopose.envs.reference_forecasts import FollowFuture
+from egopose.envs.reference_forecasts import TrackForecast
 from egopose.inference.context_states import context_states
 from egopose.inference.forecaster import forecast
 from egopose.inference.stream import messages
@@ -44,7 +44,7 @@ from egopose.inference.stream.live_forecasts import ForecastSettings, LiveForeca
 from egopose.inference.stream.outputs import open_outputs
 from egopose.models.recurrent import PastContext
 from egopose.motion.io.native import skeleton_from_json
-from egopose.pipeline.forecaster import still_futures
+from egopose.pipeline.forecaster import still_forecasts
 from egopose.pipeline.run import build_run
 from egopose.training.continued_forecast import blank_continued_forecaster
 from egopose.training.forecaster_settings import ForecasterSettings
@@ -134,7 +134,7 @@ def test_a_fall_and_broken_physics_are_told(trained: Trained) -> None:
 
 
 class Slow:
-    """Futures that take as long as they are told to."""
+    """ReferenceForecasts that take as long as they are told to."""
 
     context = 3
 
@@ -283,13 +283,13 @@ def test_a_stream_forecasts_beside_its_estimate(trained: Trained, tmp_path: Path
 def forecasting_run(trained: Trained, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run directory of an untrained forecasting policy."""
     folder = tmp_path_factory.mktemp("forecasting")
-    small = ["collector.worlds=2", "algo.steps_per_iteration=16", "algo.minibatch_size=16", "logger=csv"]
+    small = ["collector.num_envs=2", "algo.steps_per_iteration=16", "algo.minibatch_size=16", "logger=csv"]
     config = compose_config("train", ["experiment=forecasting", *small])
     size = 2 * trained.humanoid.mj_model.nq - 3
     weights = {"regressor": trained.regressor, "config": {"state_size": size, **config}}
     RunCheckpoint(weights).save(folder / "regressor", metadata=metadata_of("regressor", size, 1, 0, 0.0))
-    material = still_frames(trained.humanoid, trained.regressor, trained.made_with, 70)
-    made = build_run(config, folder, material)
+    dataset = still_frames(trained.humanoid, trained.regressor, trained.source_config, 70)
+    made = build_run(config, folder, dataset)
     made.save()
     made.collector.shutdown()
     return folder
@@ -299,7 +299,7 @@ def forecasting_run(trained: Trained, tmp_path_factory: pytest.TempPathFactory) 
 def following_run(trained: Trained, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run directory of an untrained policy that follows kinematic forecasts, whose networks are untrained too."""
     folder = tmp_path_factory.mktemp("following")
-    small = ["collector.worlds=2", "algo.steps_per_iteration=16", "algo.minibatch_size=16", "logger=csv"]
+    small = ["collector.num_envs=2", "algo.steps_per_iteration=16", "algo.minibatch_size=16", "logger=csv"]
     config = compose_config("train", ["experiment=forecasting_follow", "regressor=fast", *small])
     size = 2 * trained.humanoid.mj_model.nq - 3
     weights = {"regressor": trained.regressor, "config": {"state_size": size, **config}}
@@ -314,8 +314,8 @@ def following_run(trained: Trained, tmp_path_factory: pytest.TempPathFactory) ->
     kept["sizes"] = ComponentState(lambda: sizes, lambda _: None)
     kept["continued"] = blank_continued_forecaster(settings, torch.zeros(pose), torch.ones(pose), 30.0)
     RunCheckpoint(kept).save(folder / "forecaster", metadata=metadata_of("motion forecaster", pose, 0, 0, 0.0))
-    material = still_futures(config, still_frames(trained.humanoid, trained.regressor, trained.made_with, 70))
-    made = build_run(config, folder, material)
+    dataset = still_forecasts(config, still_frames(trained.humanoid, trained.regressor, trained.source_config, 70))
+    made = build_run(config, folder, dataset)
     made.save()
     made.collector.shutdown()
     return folder
@@ -335,7 +335,7 @@ def test_a_run_that_follows_forecasts_live_what_it_does_offline(
     other = load_forecaster(values_of(*told, f"forecast.samples={max(samples - 1, 1)}"), trained)
     assert other is not None
     assert other.curves is not None
-    (follow,) = (part for part in other.env.transform if isinstance(part, FollowFuture))
+    (follow,) = (part for part in other.env.transform if isinstance(part, TrackForecast))
     now, problem = torch.tensor([CONTEXT - 1]), other.env.base_env.problem
     seen = context_states(other.regressor, torch.from_numpy(moment.flow), [0], CONTEXT).double()
     follow.futures.put(other.curves(seen), now)
@@ -360,10 +360,10 @@ def test_a_forecasting_run_is_used_by_its_path(run: Path, forecasting_run: Path,
         assert written["frame"].tolist() == [29, 38]
     with pytest.raises(InputError, match="this run's is estimation: a live forecast is one of"):
         stream({**chosen, "forecast": {**chosen["forecast"], "checkpoint": str(run)}})
-    other = {**load_trained(str(run), "latest").made_with}
+    other = {**load_trained(str(run), "latest").source_config}
     other["vision"] = {**other["vision"], "flow": {**other["vision"]["flow"], "working_size": 64}}
     with pytest.raises(InputError, match="another flow"):
-        load_forecaster(chosen, replace(untrained(), made_with=other))
+        load_forecaster(chosen, replace(untrained(), source_config=other))
 
 
 def test_a_soak_reports_what_is_promised(

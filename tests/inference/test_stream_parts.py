@@ -21,7 +21,7 @@ from egopose.inference.stream import frame_sources as sources
 from egopose.inference.stream import messages
 from egopose.inference.stream.broadcast import ServerSettings
 from egopose.inference.stream.clock import ControlClock
-from egopose.inference.stream.frame_features import Sight
+from egopose.inference.stream.frame_features import FrameFeatures
 from egopose.inference.stream.frame_sources import (
     PictureTimes,
     ReconnectSettings,
@@ -270,7 +270,7 @@ def test_flow_is_that_of_a_control_frame_at_any_rate(tmp_path: Path, fps: float)
         images.append(cv2.warpAffine(texture, shifts, (160, 160)))
     write_video(tmp_path / "x.mp4", images, fps)
     flow = FlowConfig("medium", 128, 64)
-    sight, clock = Sight(None, flow, Camera(), 30.0), ControlClock(30.0)
+    sight, clock = FrameFeatures(None, flow, Camera(), 30.0), ControlClock(30.0)
     moved, steps = [], 0
     for picture in pictures(source_of(tmp_path / "x.mp4", "every")):
         if count := clock.intervals(picture.time):
@@ -312,7 +312,7 @@ def test_the_cameras_lens_and_shutter_are_undone_as_offline(tmp_path: Path) -> N
     video = write_walk(tmp_path / "walk.mp4", 12)
     camera, flow = Camera(field_of_view=110.0, lens="fisheye", readout=0.02), FlowConfig("medium", 128, 64)
     offline = extract_flow(video, flow, 30.0, 0.5 * camera.readout, camera=camera)
-    sight = Sight(None, flow, camera, 30.0)
+    sight = FrameFeatures(None, flow, camera, 30.0)
     live = [sight.flow(picture.image, picture.time) for picture in pictures(source_of(video, "every"))]
     np.testing.assert_allclose(live, offline, atol=1e-3)
     plain = extract_flow(video, flow)

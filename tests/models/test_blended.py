@@ -218,7 +218,7 @@ def test_a_store_makes_keeps_and_reads_back_a_blended_regressor(folder: Path, mo
     assert {tuple(pair) for pair in card["shares"].values()} == {(0.3, 0.6)}
 
     # On training frames neither part has seen the frame; elsewhere the loaded weights say the same.
-    model, made_with = load_regressor(weights)
+    model, source_config = load_regressor(weights)
     kernel_settings = KernelSettings(**KERNEL)
     whole = [Span(t.offset, t.offset + t.length) for t in store.takes]
     half = [Span(s.start, s.start + round((s.stop - s.start) / 2)) for s in whole]
@@ -235,7 +235,7 @@ def test_a_store_makes_keeps_and_reads_back_a_blended_regressor(folder: Path, mo
         expected = model.head.network_share * by_network[rows] + model.head.kernel_share * kernel(table[rows])
         found = model.normalise(tables["humanoid_state"][rows])
         torch.testing.assert_close(found, expected, atol=1e-4, rtol=1e-4)
-    seen = seen_in(humanoid, model, np.asarray(store.flow(flow)[whole[0].start : whole[0].stop]), made_with)
+    seen = seen_in(humanoid, model, np.asarray(store.flow(flow)[whole[0].start : whole[0].stop]), source_config)
     tail = slice(half[0].stop, whole[0].stop)
     torch.testing.assert_close(torch.as_tensor(seen["humanoid_state"])[tail], tables["humanoid_state"][tail])
     assert tables["visual_context"].shape[1] == tables["humanoid_state"].shape[1]

@@ -37,9 +37,9 @@ from egopose.models.motion_forecast import KernelForecaster, spline_basis, splin
 from egopose.models.predictions import predict_takes
 from egopose.pipeline import forecaster as motion_forecasts
 from egopose.pipeline import regressor as regression
-from egopose.pipeline.forecaster import ForecastCurves, Members, with_futures
+from egopose.pipeline.forecaster import ForecastCurves, Members, with_forecasts
 from egopose.pipeline.regressor import load_regressor, regressor_name, regressor_tables, training_contexts
-from egopose.tasks.dataset import Material, take_table
+from egopose.tasks.dataset import Dataset, take_table
 from egopose.training import blended_regressor as blending
 from egopose.training import past_contexts as past
 from egopose.training.blended_regressor import KernelSettings
@@ -315,10 +315,10 @@ def stored(folder: Path) -> dict[str, Any]:
     return config
 
 
-def material_of(config: dict[str, Any], store: TakeStore) -> Material:
+def dataset_of(config: dict[str, Any], store: TakeStore) -> Dataset:
     pieces = split_takes(store.takes, config["data"]["split"], "train", supported_only=False)
     states = humanoid_state(store.reference).float()
-    return Material(humanoid_of(config), store.reference, take_table(store.takes), pieces, pieces, states=states)
+    return Dataset(humanoid_of(config), store.reference, take_table(store.takes), pieces, pieces, states=states)
 
 
 @torch.no_grad()
@@ -334,13 +334,13 @@ def test_a_run_learns_keeps_and_reads_back_networks_and_kernel(
     folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     config, store = stored(folder), TakeStore.open(folder / "store")
-    material = material_of(config, store)
-    assert material.states is not None
+    dataset = dataset_of(config, store)
+    assert dataset.states is not None
     networks: list[Any] = []
     kernels: list[KernelForecaster] = []
     asked: list[Any] = []
     fit_network, fit_kernel = fit, fit_kernel_forecaster
-    noisy = material.states + 0.1 * torch.randn(material.states.shape)
+    noisy = dataset.states + 0.1 * torch.randn(dataset.states.shape)
 
     def contexts(_: Any, __: Any, ___: Any, name: str, starts: Tensor, context: int) -> Tensor:
         assert (name, context) == (flow_name(config), CONTEXT)
@@ -358,13 +358,13 @@ def test_a_run_learns_keeps_and_reads_back_networks_and_kernel(
     for name, stand in (("training_contexts", contexts), ("fit", learned), ("fit_kernel_forecaster", learned_kernel)):
         monkeypatch.setattr(motion_forecasts, name, stand)
     run = tmp_path / "run"
-    followed = with_futures(config, material, run)
+    followed = with_forecasts(config, dataset, run)
     assert (len(networks), len(kernels)) == (6, 3)
     whole = [Span(0, 38), Span(38, 77)]
     made = motion_forecasts._settings(config)[0]
     parts = cross_fit_starts(whole, cross_fit_blocks(whole, 2), made)
     assert [given[2] for given in asked] == [whole, *(others for others, _ in parts)]
-    size = 11 + material.humanoid.mj_model.nu
+    size = 11 + dataset.humanoid.mj_model.nu
     assert torch.equal(asked[0][0].rows[0], noisy[:5, :size])
 
     futures = followed.futures
@@ -377,8 +377,8 @@ def test_a_run_learns_keeps_and_reads_back_networks_and_kernel(
 
     # Read back it is exactly what was learned: what the networks hold out to judge themselves by the kernel learns.
     assert not torch.equal(networks[0].mean, kernels[0].mean)
-    pasts = torch.randn(3, CONTEXT, material.states.shape[1]).cumsum(1)
-    told = ForecastCurves(config, material, run)(pasts)
+    pasts = torch.randn(3, CONTEXT, dataset.states.shape[1]).cumsum(1)
+    told = ForecastCurves(config, dataset, run)(pasts)
     kept = motion_forecasts._members(made, run / FOLDER, size, FPS)
     assert kept.share == 0.3
     for one, other in zip([*networks[:2], kernels[0]], [*kept.networks, kept.kernel], strict=True):
@@ -388,7 +388,7 @@ def test_a_run_learns_keeps_and_reads_back_networks_and_kernel(
     assert (told - mixed(networks[:2], kernels[0], 0.0, pasts[..., :size])).abs().max() > 0.05
     for name in ("fit", "fit_kernel_forecaster"):
         monkeypatch.setattr(motion_forecasts, name, lambda *_: pytest.fail("learned twice"))
-    again = with_futures(config, material, run).futures
+    again = with_forecasts(config, dataset, run).futures
     assert again is not None
     assert torch.equal(again.coefficients, futures.coefficients)
 
@@ -397,8 +397,8 @@ def test_a_run_learns_keeps_and_reads_back_networks_and_kernel(
     assert there == ["members", "kernel", "sizes"]
     _copy_components(run / FOLDER, shipped / FOLDER, there)
     assert not has_component(shipped / FOLDER, "futures")
-    assert torch.equal(ForecastCurves(config, material, shipped)(pasts), told)
-    afresh = with_futures(config, material, shipped).futures
+    assert torch.equal(ForecastCurves(config, dataset, shipped)(pasts), told)
+    afresh = with_forecasts(config, dataset, shipped).futures
     assert afresh is not None
     assert len(afresh.starts) == 0
     assert (afresh.coefficients.shape[1:], afresh.horizon) == (futures.coefficients.shape[1:], 6)
@@ -410,9 +410,9 @@ def test_a_run_with_one_that_goes_on_frame_by_frame_learns_keeps_ships_and_reads
     config, store = stored(folder), TakeStore.open(folder / "store")
     config["forecaster"]["members"] = 1
     config["forecaster"]["continued"] = continued(share=0.4, until=5)
-    material = material_of(config, store)
-    assert material.states is not None
-    size, noisy = 11 + material.humanoid.mj_model.nu, material.states + 0.1 * torch.randn(material.states.shape)
+    dataset = dataset_of(config, store)
+    assert dataset.states is not None
+    size, noisy = 11 + dataset.humanoid.mj_model.nu, dataset.states + 0.1 * torch.randn(dataset.states.shape)
     monkeypatch.setattr(
         motion_forecasts, "training_contexts",
         lambda _, __, ___, ____, starts, context: noisy[starts[:, None] + torch.arange(1 - context, 1)],
@@ -436,7 +436,7 @@ def test_a_run_with_one_that_goes_on_frame_by_frame_learns_keeps_ships_and_reads
     for name in made_of:
         monkeypatch.setattr(motion_forecasts, name, spied(name))
     run = tmp_path / "run"
-    futures = with_futures(config, material, run).futures
+    futures = with_forecasts(config, dataset, run).futures
     assert futures is not None
     networks, kernels, others = made_of.values()
     assert (len(networks), len(kernels), len(others)) == (3, 3, 3)
@@ -445,9 +445,9 @@ def test_a_run_with_one_that_goes_on_frame_by_frame_learns_keeps_ships_and_reads
     parts = cross_fit_starts(whole, cross_fit_blocks(whole, 2), made)
     assert [given[1] for given in asked] == [whole, *(rest for rest, _ in parts)]
     for truth, _, mirror, given, fps, seed in asked:
-        assert torch.equal(truth, material.states[:, :size])
-        assert torch.equal(mirror.index, state_mirror(material.humanoid.skeleton).poses().index)
-        assert (given, fps, seed) == (made, 1 / material.humanoid.control_dt, config["seed"])
+        assert torch.equal(truth, dataset.states[:, :size])
+        assert torch.equal(mirror.index, state_mirror(dataset.humanoid.skeleton).poses().index)
+        assert (given, fps, seed) == (made, 1 / dataset.humanoid.control_dt, config["seed"])
 
     share = torch.tensor([max(0.0, 0.4 * (1 - float(t) / 5)) for t in spline_times(7, SMALL["spacing"])])[:, None]
     assert share[0] == 0.4
@@ -475,9 +475,9 @@ def test_a_run_with_one_that_goes_on_frame_by_frame_learns_keeps_ships_and_reads
         assert not read.training
     own = [value for part in (kept.networks[0], kept.kernel, kept.continued) for value in (part.mean, part.std)]  # type: ignore[union-attr]
     assert len({value.data_ptr() for value in own}) == len(own), "each has statistics of its own"
-    pasts = torch.randn(3, CONTEXT, material.states.shape[1]).cumsum(1)
+    pasts = torch.randn(3, CONTEXT, dataset.states.shape[1]).cumsum(1)
     learned = Members(networks[:1], kernels[0], 0.3, others[0], continued_share(made))
-    told = ForecastCurves(config, material, run)(pasts)
+    told = ForecastCurves(config, dataset, run)(pasts)
     seen = pasts[..., :size]
     assert kept.continued is not None
     with torch.no_grad():
@@ -491,30 +491,30 @@ def test_a_run_with_one_that_goes_on_frame_by_frame_learns_keeps_ships_and_reads
     there = [name for name in PARTS if has_component(run / FOLDER, name)]
     assert there == ["members", "kernel", "sizes", "continued"]
     _copy_components(run / FOLDER, tmp_path / "shipped" / FOLDER, there)
-    assert torch.equal(ForecastCurves(config, material, tmp_path / "shipped")(pasts), told)
+    assert torch.equal(ForecastCurves(config, dataset, tmp_path / "shipped")(pasts), told)
     for name in made_of:
         monkeypatch.setattr(motion_forecasts, name, lambda *_: pytest.fail("learned twice"))
-    again = with_futures(config, material, run).futures
+    again = with_forecasts(config, dataset, run).futures
     assert again is not None
     assert torch.equal(again.coefficients, futures.coefficients)
 
     # A run's folder without it is no run of these settings.
     _copy_components(run / FOLDER, tmp_path / "less" / FOLDER, there[:-1])
     with pytest.raises(InputError, match="continued"):
-        ForecastCurves(config, material, tmp_path / "less")
+        ForecastCurves(config, dataset, tmp_path / "less")
     # Settings without it, as of runs from before there was one, read what such a run kept.
     forecaster = config["forecaster"]
     for older in ({**forecaster, "continued": None}, {k: v for k, v in forecaster.items() if k != "continued"}):
-        found = ForecastCurves({**config, "forecaster": older}, material, tmp_path / "less")(pasts)
+        found = ForecastCurves({**config, "forecaster": older}, dataset, tmp_path / "less")(pasts)
         torch.testing.assert_close(found, without, atol=1e-5, rtol=1e-5)
 
 
 def test_a_run_from_before_there_was_a_kernel_forecasts_by_its_networks_alone(folder: Path, tmp_path: Path) -> None:
     config, store = stored(folder), TakeStore.open(folder / "store")
     config["forecaster"] = {key: value for key, value in config["forecaster"].items() if key != "kernel"}
-    material, made = material_of(config, store), motion_forecasts._settings(config)[0]
+    dataset, made = dataset_of(config, store), motion_forecasts._settings(config)[0]
     assert made.kernel is None
-    size = 11 + material.humanoid.mj_model.nu
+    size = 11 + dataset.humanoid.mj_model.nu
     networks = [build_forecaster(made, torch.randn(size), 1 + torch.rand(size), FPS, seed).eval() for seed in range(2)]
     table = {"coefficients": torch.zeros(1, 5, size), "starts": torch.tensor([7])}
     kept = {"members": nn.ModuleList(networks), "futures": ComponentState(lambda: table, lambda _: None)}
@@ -522,11 +522,11 @@ def test_a_run_from_before_there_was_a_kernel_forecasts_by_its_networks_alone(fo
     assert [name for name in PARTS if has_component(tmp_path / FOLDER, name)] == ["members"]
     pasts = torch.randn(3, CONTEXT, 2 * size - 11)
     expected = motion_forecasts._curves(Members(networks, None, 0.0), pasts[..., :size])
-    assert torch.equal(ForecastCurves(config, material, tmp_path)(pasts), expected)
+    assert torch.equal(ForecastCurves(config, dataset, tmp_path)(pasts), expected)
     seen = pasts[..., :size]
     by_hand = sum(network((seen - network.mean) / network.std) * network.std + network.mean for network in networks)
     torch.testing.assert_close(expected, by_hand.detach() / 2)
-    found = with_futures(config, material, tmp_path).futures
+    found = with_forecasts(config, dataset, tmp_path).futures
     assert found is not None
     assert found.starts.tolist() == [7]
 

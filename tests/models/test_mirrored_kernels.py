@@ -19,7 +19,7 @@ from test_material import configuration, fill_flow
 from torch import Tensor
 
 from egopose.checkpoint import pretrained as weights
-from egopose.checkpoint.body_parts import load_finder
+from egopose.checkpoint.body_parts import load_body_part_estimator
 from egopose.checkpoint.checkpoint import read_json
 from egopose.core.config import from_mapping
 from egopose.core.errors import InputError
@@ -36,8 +36,8 @@ from egopose.models.regressor import StateRegressor
 from egopose.pipeline.regressor import load_regressor, regressor_name, regressor_tables
 from egopose.training import blended_regressor as blending
 from egopose.training.blended_regressor import KernelSettings, fit_kernels, window_table
-from egopose.training.body_parts import posture_mirror, save_finder
-from egopose.vision.body_parts import LimbFinder, as_plane
+from egopose.training.body_parts import posture_mirror, save_body_part_estimator
+from egopose.vision.body_parts import BodyPartEstimator, as_plane
 from egopose.vision.encoders import LightFlowEncoder
 from egopose.vision.flow import FlowConfig
 
@@ -142,10 +142,10 @@ def test_frame_by_frame_three_sets_show_what_the_video_up_to_there_does() -> Non
 # --- mirror images of limbs ------------------------------------------------------------------------------------------
 
 
-def mirroring_finder(pairs: int, single: int, seed: int) -> LimbFinder:
+def mirroring_finder(pairs: int, single: int, seed: int) -> BodyPartEstimator:
     """Numbers that change places in pairs, of either sign, and others that stay; each with a scale of its own."""
     numbers, generator = 2 * pairs + single, torch.Generator().manual_seed(seed)
-    finder = LimbFinder(numbers, 8)
+    finder = BodyPartEstimator(numbers, 8)
     order = torch.randperm(numbers, generator=generator)
     first, second = order[: 2 * pairs].chunk(2)
     finder.mirror_index[first], finder.mirror_index[second] = second, first
@@ -177,13 +177,13 @@ def test_limbs_mirrored_are_mirrored_in_the_units_of_their_numbers(pairs: int, s
 
 def test_rows_as_kept_are_mirrored_in_single_precision() -> None:
     rows = torch.randn(5, 2 * 89).half()
-    image = load_finder("limbs").mirrored_rows(rows)
+    image = load_body_part_estimator("limbs").mirrored_rows(rows)
     assert image.dtype == torch.float32
-    torch.testing.assert_close(image, load_finder("limbs").mirrored_rows(rows.float()), rtol=0, atol=0)
+    torch.testing.assert_close(image, load_body_part_estimator("limbs").mirrored_rows(rows.float()), rtol=0, atol=0)
 
 
 def test_the_shipped_finder_mirrors_as_the_humanoid_does(humanoid: HumanoidModel) -> None:
-    finder, mirror = load_finder("limbs"), posture_mirror(humanoid.skeleton)
+    finder, mirror = load_body_part_estimator("limbs"), posture_mirror(humanoid.skeleton)
     assert torch.equal(finder.mirror_index, mirror.index)
     assert torch.equal(finder.mirror_sign, mirror.sign)
     rows = torch.randn(20, 2 * finder.numbers)
@@ -196,12 +196,12 @@ def test_the_shipped_finder_mirrors_as_the_humanoid_does(humanoid: HumanoidModel
 def test_a_finder_read_back_mirrors_as_before(
     humanoid: HumanoidModel, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    model, mirror = LimbFinder(89, 8), posture_mirror(humanoid.skeleton)
+    model, mirror = BodyPartEstimator(89, 8), posture_mirror(humanoid.skeleton)
     model.mean.normal_()
     model.std.uniform_(0.1, 2.0)
-    save_finder(tmp_path / "kept", model, humanoid.skeleton, FlowConfig("fast", 64, 32), {}, 1)
+    save_body_part_estimator(tmp_path / "kept", model, humanoid.skeleton, FlowConfig("fast", 64, 32), {}, 1)
     monkeypatch.setattr(weights, "FOLDER", tmp_path)
-    again = load_finder.__wrapped__("kept")
+    again = load_body_part_estimator.__wrapped__("kept")
     assert torch.equal(again.mirror_index, mirror.index)
     assert torch.equal(again.mirror_sign, mirror.sign)
     rows = torch.randn(4, 2 * 89)
@@ -228,7 +228,7 @@ def test_the_table_of_the_mirror_image_is_the_table_of_the_mirrored_clip(limbs: 
     image = mirrored_clip(flow)
     if limbs is not None:
         rows = torch.from_numpy(draw.normal(size=(40, 2 * 89)).astype(np.float32))
-        seen = (rows, load_finder(limbs).mirrored_rows(rows))
+        seen = (rows, load_body_part_estimator(limbs).mirrored_rows(rows))
         flow, image = (
             np.concatenate([a, as_plane(b.numpy(), 14)], axis=1) for a, b in zip((flow, image), seen, strict=True)
         )
@@ -372,7 +372,7 @@ def test_a_store_makes_keeps_and_reads_back_mirrored_kernels_of_several_sets(
     saved = read_json(weights_folder, "config")
     assert (saved["centres"], saved["axes"]) == (30, [20, 20, 8])
     assert store.table_card(regressor_name(config, store, flow))["centres"] == 30
-    model, made_with = load_regressor(weights_folder)
+    model, source_config = load_regressor(weights_folder)
     assert [kernel.centres.shape for kernel in model.head.kernel.kernels] == [(30, 20), (30, 20), (30, 8)]
 
     chosen = from_mapping(KernelSettings, STORED, "x")
@@ -399,6 +399,6 @@ def test_a_store_makes_keeps_and_reads_back_mirrored_kernels_of_several_sets(
     on_all = MeanOfKernels(fit_kernels(table, wanted, half, chosen, importance, image))
     torch.testing.assert_close(model.head.kernel(table), on_all(table), atol=1e-4, rtol=1e-4)
     for take, train in zip(whole, half, strict=True):
-        seen = seen_in(humanoid, model, np.asarray(store.flow(flow)[take.start : take.stop]), made_with)
+        seen = seen_in(humanoid, model, np.asarray(store.flow(flow)[take.start : take.stop]), source_config)
         found = torch.as_tensor(seen["humanoid_state"])[train.stop - take.start :]
         torch.testing.assert_close(found, tables["humanoid_state"][train.stop : take.stop])

@@ -25,7 +25,7 @@ from egopose.core.errors import InputError
 from egopose.data.spans import Span, cross_fit_blocks, group_blocks
 from egopose.data.windows import ForecastWindow
 from egopose.envs.mdp.observations import humanoid_state
-from egopose.envs.reference_forecasts import Futures
+from egopose.envs.reference_forecasts import ReferenceForecasts
 from egopose.evaluation import metrics
 from egopose.inference.forecast_start import begin_forecasts
 from egopose.models.mirror import StateMirror
@@ -33,9 +33,9 @@ from egopose.models.motion_forecast import spline_basis
 from egopose.motion import rotations as rot
 from egopose.pipeline.agent import Agent
 from egopose.pipeline.environment import build_env
-from egopose.pipeline.forecaster import with_futures
+from egopose.pipeline.forecaster import with_forecasts
 from egopose.pipeline.networks import build_networks
-from egopose.tasks.dataset import Material
+from egopose.tasks.dataset import Dataset
 from egopose.training.fitting import FitSettings, fit
 from egopose.training.forecaster_settings import ForecasterSettings
 from egopose.training.kernel_forecast import Contexts
@@ -64,26 +64,26 @@ def test_splines_hold_cubics_and_their_slopes() -> None:
 
 
 @pytest.fixture(scope="module")
-def material() -> Material:
+def dataset() -> Dataset:
     humanoid: Any = stand_in()
     reference, takes = reference_motion(humanoid)
     states = humanoid_state(reference).float()
-    return Material(humanoid, reference, takes, PIECES, PIECES, states=states)
+    return Dataset(humanoid, reference, takes, PIECES, PIECES, states=states)
 
 
-def curves(material: Material, horizon: int = 12) -> Futures:
+def curves(dataset: Dataset, horizon: int = 12) -> ReferenceForecasts:
     """Curves from every frame of the first take that fit the reference from there on."""
-    poses = humanoid_state(material.reference).float()
+    poses = humanoid_state(dataset.reference).float()
     size = 11 + (poses.shape[1] - 11) // 2
     basis = spline_basis(horizon + 1, 3, FPS)[0]
-    last = int(material.takes.lengths[0]) - 1
+    last = int(dataset.takes.lengths[0]) - 1
     starts = torch.arange(last)
     futures = poses[(starts[:, None] + torch.arange(horizon + 1)).clamp(max=last), :size]
-    return Futures(torch.linalg.pinv(basis) @ futures, starts, len(poses), horizon, 3, FPS)
+    return ReferenceForecasts(torch.linalg.pinv(basis) @ futures, starts, len(poses), horizon, 3, FPS)
 
 
-def test_curves_are_looked_up_as_splines_are_evaluated(material: Material) -> None:
-    futures = curves(material)
+def test_curves_are_looked_up_as_splines_are_evaluated(dataset: Dataset) -> None:
+    futures = curves(dataset)
     basis, slope = spline_basis(13, 3, FPS)
     start, step = torch.tensor([3, 0, 7, 7]), torch.tensor([0, 5, 12, 40])
     whole = basis[step.clamp(max=12)][:, None] @ futures.coefficients[start]
@@ -91,19 +91,19 @@ def test_curves_are_looked_up_as_splines_are_evaluated(material: Material) -> No
     rates = (slope[step.clamp(max=12)][:, None] @ futures.coefficients[start])[:, 0, 5:-6]
     torch.testing.assert_close(futures.states(start, step), torch.cat([whole[:, 0], rates], dim=-1))
     with pytest.raises(ValueError, match="no forecast begins at frame"):
-        futures.poses(torch.tensor([len(material.reference) - 1]), torch.tensor([0]))
+        futures.poses(torch.tensor([len(dataset.reference) - 1]), torch.tensor([0]))
 
     other = torch.zeros_like(futures.coefficients[:2])
     before = futures.poses(torch.tensor([5]), torch.tensor([2]))
-    futures.put(other, torch.tensor([7, len(material.reference) - 1]))
-    assert not futures.poses(torch.tensor([7, len(material.reference) - 1]), torch.tensor([4, 0])).any()
+    futures.put(other, torch.tensor([7, len(dataset.reference) - 1]))
+    assert not futures.poses(torch.tensor([7, len(dataset.reference) - 1]), torch.tensor([4, 0])).any()
     torch.testing.assert_close(futures.poses(torch.tensor([5]), torch.tensor([2])), before)
 
 
-def test_bodies_begin_where_the_curve_does_and_the_reference_stands(material: Material) -> None:
-    futures, frame = curves(material), torch.tensor([2, 6])
-    reference = torch.as_tensor(material.reference["qpos"][frame + 1]).double()
-    qpos, qvel = futures.first_state(frame, reference, np.asarray(material.humanoid.joint_range))
+def test_bodies_begin_where_the_curve_does_and_the_reference_stands(dataset: Dataset) -> None:
+    futures, frame = curves(dataset), torch.tensor([2, 6])
+    reference = torch.as_tensor(dataset.reference["qpos"][frame + 1]).double()
+    qpos, qvel = futures.first_state(frame, reference, np.asarray(dataset.humanoid.joint_range))
     torch.testing.assert_close(qpos[:, :2], reference[:, :2])
     facing = [rot.heading(part[:, 3:7].numpy()) for part in (qpos, reference)]
     np.testing.assert_allclose(np.abs((facing[0] * facing[1]).sum(-1)), 1.0, atol=1e-9)
@@ -202,17 +202,17 @@ def configuration() -> dict[str, Any]:
     return {**CONFIG, "task": task, "forecaster": {**group("forecaster", "fast"), **SMALL}}
 
 
-def test_the_start_policy_asks_for_the_curves_next_pose(material: Material) -> None:
-    followed, config = replace(material, futures=curves(material)), configuration()
+def test_the_start_policy_asks_for_the_curves_next_pose(dataset: Dataset) -> None:
+    followed, config = replace(dataset, forecasts=curves(dataset)), configuration()
     config["task"] = {**config["task"], "follow": {**config["task"]["follow"], "velocity_feedforward": 0.0}}
-    env = build_env(config, followed, worlds=3, fragments=PIECES[:1])
+    env = build_env(config, followed, num_envs=3, fragments=PIECES[:1])
     config["model"] = {**config["model"], "final_gain": 0.0}
     actor, critic = build_networks(config, followed, env)
     observation = critic(actor(env.reset()))
     start = observation["episode_start"].squeeze(-1)
     assert followed.futures is not None
     following = followed.futures.poses(start, torch.ones_like(start))[:, 5:-6]
-    rest = torch.as_tensor(material.humanoid.rest_action).float()
+    rest = torch.as_tensor(dataset.humanoid.rest_action).float()
     torch.testing.assert_close(observation["loc"] + rest, following, atol=1e-6, rtol=0)
     # Episodes begin on the curve: nothing to correct.
     size = observation["tracking_error"].shape[-1] // 2
@@ -221,20 +221,20 @@ def test_the_start_policy_asks_for_the_curves_next_pose(material: Material) -> N
     env.close()
 
 
-def test_what_knows_the_future_is_refused(material: Material) -> None:
-    followed, config = replace(material, futures=curves(material)), configuration()
+def test_what_knows_the_future_is_refused(dataset: Dataset) -> None:
+    followed, config = replace(dataset, forecasts=curves(dataset)), configuration()
     task = {**config["task"], "action": {**config["task"]["action"], "reference": "regressor"}}
     with pytest.raises(InputError, match="forecaster"):
-        build_env({**config, "task": task}, followed, worlds=1)
+        build_env({**config, "task": task}, followed, num_envs=1)
     with pytest.raises(InputError, match="follow"):
-        build_env({**config, "task": {**config["task"], "follow": None}}, followed, worlds=1)
-    env = build_env(config, followed, worlds=1, fragments=PIECES[:1])
+        build_env({**config, "task": {**config["task"], "follow": None}}, followed, num_envs=1)
+    env = build_env(config, followed, num_envs=1, fragments=PIECES[:1])
     with pytest.raises(InputError, match="base"):
         build_networks({**config, "model": {**config["model"], "base": "time_left"}}, followed, env)
 
 
-def test_a_forecast_follows_what_its_context_shows_and_nothing_else(material: Material, tmp_path: Path) -> None:
-    followed, config = replace(material, futures=curves(material)), configuration()
+def test_a_forecast_follows_what_its_context_shows_and_nothing_else(dataset: Dataset, tmp_path: Path) -> None:
+    followed, config = replace(dataset, forecasts=curves(dataset)), configuration()
     assert followed.futures is not None
     size, made = followed.futures.coefficients.shape[-1], settings()
     members = nn.ModuleList(
@@ -248,7 +248,7 @@ def test_a_forecast_follows_what_its_context_shows_and_nothing_else(material: Ma
     path.mkdir(parents=True)
     actor, critic = nn.Identity(), nn.Identity()
     agent = Agent(actor, critic, config, followed, partial(build_env, config, followed), path)  # type: ignore[arg-type]
-    states = material.states
+    states = dataset.states
     assert states is not None
     windows = [ForecastWindow(0, 0, 5, 12), ForecastWindow(0, 9, 5, 12)]
     pasts = torch.stack([states[w.start : w.start + 5] for w in windows]).double()
@@ -263,9 +263,9 @@ def test_a_forecast_follows_what_its_context_shows_and_nothing_else(material: Ma
 
 
 def test_shipped_forecasters_bring_no_curves_of_training_and_forecast_the_same(
-    material: Material, tmp_path: Path
+    dataset: Dataset, tmp_path: Path
 ) -> None:
-    config, known = configuration(), curves(material)
+    config, known = configuration(), curves(dataset)
     size, made = known.coefficients.shape[-1], settings()
     members = nn.ModuleList(
         [build_forecaster(made, torch.zeros(size), torch.ones(size), FPS, seed) for seed in range(made.members)]
@@ -275,12 +275,12 @@ def test_shipped_forecasters_bring_no_curves_of_training_and_forecast_the_same(
         tmp_path / "run" / FOLDER, metadata=metadata_of("motion forecaster", size, 0, 0, 0.0)
     )
     _copy_components(tmp_path / "run" / FOLDER, tmp_path / "shipped" / FOLDER, ("members",))
-    assert material.states is not None
+    assert dataset.states is not None
     windows = [ForecastWindow(0, 9, 5, 12)]
-    pasts = material.states[9:14][None].double()
+    pasts = dataset.states[9:14][None].double()
     found = []
     for run in ("run", "shipped"):
-        followed = with_futures(config, material, tmp_path / run)
+        followed = with_forecasts(config, dataset, tmp_path / run)
         assert followed.futures is not None
         assert len(followed.futures.starts) == (0 if run == "shipped" else len(known.starts))
         path = tmp_path / run / "checkpoints" / "checkpoint-1"
@@ -290,7 +290,7 @@ def test_shipped_forecasters_bring_no_curves_of_training_and_forecast_the_same(
         qpos, qvel = begin_forecasts(agent, windows, pasts)
         now = torch.tensor([windows[0].now])
         found.append((qpos, qvel, *(followed.futures.poses(now, now * 0 + step) for step in range(12))))
-        make_env(worlds=1).close()
+        make_env(num_envs=1).close()
     assert all(torch.equal(one, other) for one, other in zip(*found, strict=True))
 
 

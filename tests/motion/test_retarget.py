@@ -17,7 +17,7 @@ from egopose.data.prepare_motion import low_pass, reference_motion, without_lead
 from egopose.humanoid.foot_geometry import sole_names, sole_positions
 from egopose.motion import rotations as rot
 from egopose.motion.foot_contact_ik import plant_feet
-from egopose.motion.ground_alignment import SettleSettings, settle
+from egopose.motion.ground_alignment import GroundAlignmentSettings, settle
 from egopose.motion.inverse_kinematics import Targets, solve
 from egopose.motion.io import read_motion
 from egopose.motion.kinematics import forward_kinematics
@@ -362,7 +362,7 @@ def jump(frames: int = 90, apex: float = 0.5) -> Motion:
 @given(height=st.floats(-3.0, 3.0))
 def test_a_standing_body_is_put_on_the_floor_from_anywhere(height: float) -> None:
     motion = standing(30, height)
-    settled, shift = settle(motion, sole_positions(HUMANOID, motion), SettleSettings(depth=0.004))
+    settled, shift = settle(motion, sole_positions(HUMANOID, motion), GroundAlignmentSettings(depth=0.004))
     assert sole_positions(HUMANOID, settled)[..., 2] == pytest.approx(-0.004, abs=1e-6)
     assert shift == pytest.approx(-height - 0.004, abs=1e-6)
     assert settled.contacts is not None
@@ -388,8 +388,8 @@ def test_a_flight_falls_as_gravity_has_it() -> None:
     fall = 0.125 * 9.81 * ((third + 1) / 30.0) ** 2
     flat = jump(frames, apex=0.67 * fall)
     body = flat.qpos[:, :3]
-    plain, _ = settle(flat, sole_positions(HUMANOID, flat), SettleSettings(largest=1.0))
-    held, _ = settle(flat, sole_positions(HUMANOID, flat), SettleSettings(largest=1.0), center_of_mass=body)
+    plain, _ = settle(flat, sole_positions(HUMANOID, flat), GroundAlignmentSettings(largest=1.0))
+    held, _ = settle(flat, sole_positions(HUMANOID, flat), GroundAlignmentSettings(largest=1.0), center_of_mass=body)
     rise = [float((m.qpos[30:60, 2] - m.qpos[10, 2]).max()) for m in (plain, held)]
     assert rise[0] == pytest.approx(0.67 * fall, rel=0.05)
     assert fall - rise[1] < 0.8 * (fall - rise[0])

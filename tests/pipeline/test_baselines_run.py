@@ -23,7 +23,7 @@ from egopose.models.baselines.path_pose import PathPose
 from egopose.models.baselines.recurrent import RecurrentForecaster
 from egopose.pipeline.agent import load_agent
 from egopose.pipeline.baselines import forecast_qpos, load_baseline, path_pose_motion, regressed_motion
-from egopose.pipeline.dataset import load_material
+from egopose.pipeline.dataset import load_dataset
 from egopose.pipeline.run import build_run
 from egopose.training.loop import train
 
@@ -41,7 +41,7 @@ def small(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     fill_flow(config)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(preparation, "_make_videos", lambda *_: None)
-        load_material(config, progress=False)
+        load_dataset(config, progress=False)
     return config
 
 
@@ -85,19 +85,19 @@ def test_a_forecaster_is_trained_goes_on_and_forecasts_from_where_it_stands(
     with pytest.raises(InputError, match="seed"):
         run_baseline_job({**short, "seed": 8}, parted)
 
-    material = load_material(small, progress=False)
+    dataset = load_dataset(small, progress=False)
     model = load_baseline(whole).model
     assert isinstance(model, RecurrentForecaster)
-    windows = forecast_windows(material.test, 6, 9, 5)
-    assert material.states is not None
-    offsets = material.takes.offsets.tolist()
-    contexts = torch.stack([material.states[offsets[w.take] + w.start :][:6] for w in windows])
-    futures = forecast_qpos(model, contexts, material, windows)
+    windows = forecast_windows(dataset.test, 6, 9, 5)
+    assert dataset.states is not None
+    offsets = dataset.takes.offsets.tolist()
+    contexts = torch.stack([dataset.states[offsets[w.take] + w.start :][:6] for w in windows])
+    futures = forecast_qpos(model, contexts, dataset, windows)
     assert futures.shape == (len(windows), 9, 59)
     assert np.linalg.norm(futures[:, :, 3:7], axis=-1) == pytest.approx(np.ones((len(windows), 9)))
     # PoseReg on the context goes to where the forecast goes on: a frame's way at no more than 10 m/s.
     fragment = type(windows[0])(windows[0].take, windows[0].start, 6, 0)
-    last = regressed_motion(material, fragment).qpos[-1]
+    last = regressed_motion(dataset, fragment).qpos[-1]
     assert np.linalg.norm(futures[0, 0, :2] - last[:2]) < 0.34
 
 
@@ -109,13 +109,13 @@ def test_path_pose_gives_a_motion_on_the_humanoids_skeleton(
     run_baseline_job(config, folder / "paths")
     model = load_baseline(folder / "paths").model
     assert isinstance(model, PathPose)
-    material = load_material(small, progress=False)
+    dataset = load_dataset(small, progress=False)
     flow = TakeStore.open(store_folder(config)).flow(flow_name(config))
-    fragment = material.test[0]
-    motion = path_pose_motion(model, flow, material, fragment, "test")
-    first = int(material.takes.offsets[fragment.take]) + fragment.start
+    fragment = dataset.test[0]
+    motion = path_pose_motion(model, flow, dataset, fragment, "test")
+    first = int(dataset.takes.offsets[fragment.take]) + fragment.start
     assert len(motion) == fragment.stop - fragment.start
-    assert motion.qpos[0, :2] == pytest.approx(material.reference["qpos"][first, :2].numpy())
+    assert motion.qpos[0, :2] == pytest.approx(dataset.reference["qpos"][first, :2].numpy())
 
 
 def test_what_is_no_trained_baseline_is_refused_by_name(
@@ -134,21 +134,21 @@ def test_vgail_trains_saves_and_goes_on(small: dict[str, Any], tmp_path: Path) -
     choice = compose_config("train", ["experiment=vgail"])
     discriminator = {**choice["algo"]["discriminator"], "hidden": [8], "batch": 8, "steps": 2}
     config = {**small, "task": choice["task"], "algo": {**small["algo"], "discriminator": discriminator}}
-    material = load_material(config, progress=False)
-    run = build_run(config, tmp_path / "run", material)
+    dataset = load_dataset(config, progress=False)
+    run = build_run(config, tmp_path / "run", dataset)
     before = {k: v.clone() for k, v in run.ppo.state()["discriminator"].state_dict().items()}
     train(run, [])
     after = run.ppo.state()["discriminator"].state_dict()
     assert any(not torch.equal(before[k], after[k]) for k in before)
 
     config["algo"]["iterations"] = 2
-    again = build_run(config, tmp_path / "run", material)
+    again = build_run(config, tmp_path / "run", dataset)
     again.restore(tmp_path / "run" / "checkpoints" / "checkpoint-000000000008")
     assert all(torch.equal(v, after[k]) for k, v in again.ppo.state()["discriminator"].state_dict().items())
     assert train(again, []).frames == 16
-    agent = load_agent(tmp_path / "run", material, "latest")
+    agent = load_agent(tmp_path / "run", dataset, "latest")
     assert agent.make_env("test").base_env.problem.action.kind == "torque"
 
     config["model"] = {**config["model"], "context": {**config["model"]["context"], "source": "trainable"}}
     with pytest.raises(InputError, match="frozen"):
-        build_run(config, tmp_path / "other", material)
+        build_run(config, tmp_path / "other", dataset)

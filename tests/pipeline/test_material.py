@@ -17,7 +17,7 @@ import pytest
 import torch
 from mocap import short_clips
 
-from egopose import material
+from egopose import dataset
 from egopose.checkpoint.checkpoint import RunCheckpoint, find_checkpoint, metadata_of
 from egopose.core.config import compose_config
 from egopose.core.errors import InputError
@@ -27,7 +27,7 @@ from egopose.data.preparation import fingerprint_of, flow_name, humanoid_of, pre
 from egopose.data.store import TakeStore
 from egopose.pipeline import regressor as regression
 from egopose.pipeline.agent import load_agent
-from egopose.pipeline.dataset import load_material, run_material
+from egopose.pipeline.dataset import load_dataset, run_dataset
 from egopose.pipeline.regressor import kept_tables, load_regressor, regressor_name, regressor_tables
 from egopose.pipeline.run import build_run
 from egopose.training.loop import train
@@ -51,7 +51,7 @@ def configuration(folder: Path) -> dict[str, Any]:
             "regressor.save_every=1",
             "model.hidden=[8]",
             "collector=sync",
-            "collector.worlds=2",
+            "collector.num_envs=2",
             "collector.physics_threads=1",
             "algo.steps_per_iteration=8",
             "algo.iterations=1",
@@ -80,7 +80,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     fill_flow(config)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(preparation, "_make_videos", lambda *_: None)
-        run = build_run(config, folder / "run", load_material(config, progress=False))
+        run = build_run(config, folder / "run", load_dataset(config, progress=False))
         train(run, [])
     return folder
 
@@ -116,19 +116,19 @@ def test_an_agent_reads_the_table_its_own_regressor_made(
 ) -> None:
     monkeypatch.setattr(regression, "predict_takes", lambda *_: pytest.fail("the table is there already"))
     agent = load_agent(made / "run", which="latest")
-    assert agent.material.regressor == made / "run" / "regressor"
+    assert agent.dataset.regressor == made / "run" / "regressor"
     assert json.loads((made / "run" / "provenance.json").read_text())["store_fingerprint"] == fingerprint_of(
         agent.config
     )
 
 
 def test_without_the_stores_table_the_runs_regressor_predicts_the_same(copied: Path, untrainable: None) -> None:
-    before = load_agent(copied / "run", which="latest").material
+    before = load_agent(copied / "run", which="latest").dataset
     tables = {k: getattr(before, k).clone() for k in ("visual_context", "visual_features", "joint_targets", "states")}
     shutil.rmtree(copied / "store" / "regressors")
     shutil.rmtree(copied / "store" / "tables")
     for path in (copied / "run", find_checkpoint(copied / "run")):
-        after = load_agent(path, which="latest").material
+        after = load_agent(path, which="latest").dataset
         for key, table in tables.items():
             assert torch.equal(getattr(after, key), table), key
     assert not (copied / "store" / "tables").exists()
@@ -140,14 +140,14 @@ def test_a_store_with_another_regressor_of_the_same_name_is_not_believed(copied:
     name = regressor_name(config, store, flow_name(config))
     before = store.table(name)["visual_context"].clone()
     weights = store.root / "regressors" / name
-    model, made_with = load_regressor(weights)
+    model, source_config = load_regressor(weights)
     with torch.no_grad():
         for parameter in model.parameters():
             parameter.mul_(1.5)
-    metadata = metadata_of("regressor", made_with["state_size"], 1, 0, 0.0)
-    RunCheckpoint({"regressor": model, "config": made_with}).save(weights, metadata=metadata)
+    metadata = metadata_of("regressor", source_config["state_size"], 1, 0, 0.0)
+    RunCheckpoint({"regressor": model, "config": source_config}).save(weights, metadata=metadata)
     store.write_table(name, {k: v + 1 for k, v in store.table(name).items()}, {"flow": flow_name(config)})
-    loaded = load_agent(copied / "run", which="latest").material.visual_context
+    loaded = load_agent(copied / "run", which="latest").dataset.visual_context
     assert loaded is not None
     assert torch.equal(loaded, before)
 
@@ -176,11 +176,11 @@ def test_older_runs_noted_no_store(copied: Path, untrainable: None) -> None:
 
 
 def test_a_run_does_not_go_on_with_another_store(made: Path, no_videos: None, tmp_path: Path) -> None:
-    found = load_agent(made / "run", which="latest").material
+    found = load_agent(made / "run", which="latest").dataset
     found.keep_provenance(tmp_path)
     found.keep_provenance(tmp_path)
     with pytest.raises(InputError, match="store_fingerprint"):
-        material.replace(found, store_fingerprint="0" * 64).keep_provenance(tmp_path)
+        dataset.replace(found, store_fingerprint="0" * 64).keep_provenance(tmp_path)
 
 
 # --- fingerprints see code -------------------------------------------------------------------------------------------
@@ -307,10 +307,10 @@ def test_a_feature_file_that_vanished_is_named_and_put_back_the_run_goes_on(copi
     (file,) = (copied / "store" / "tables").glob("*/visual_context.memmap")
     file.rename(copied / "elsewhere")
     with pytest.raises(InputError, match=r"visual_context\.memmap is cut off or missing") as caught:
-        run_material(config, copied / "run")
+        run_dataset(config, copied / "run")
     assert str(file.parent) in str(caught.value)
     (copied / "elsewhere").rename(file)
-    run = build_run(config, copied / "run", run_material(config, copied / "run"))
+    run = build_run(config, copied / "run", run_dataset(config, copied / "run"))
     run.restore(find_checkpoint(copied / "run"))
     assert run.counters.iteration == 1
 

@@ -133,16 +133,16 @@ sys.path.insert(0, {tests!r})
 from toy_problem import make_run
 stand_in = types.ModuleType("egopose.pipeline")
 from egopose.training.loop import interrupts_held
-def build_run(config, folder, material):
+def build_run(config, folder, dataset):
     with interrupts_held():
         return make_run(folder, seed=config["seed"], config=config, iterations=config["algo"]["iterations"],
                         checkpoint_every=config["training"]["checkpoint_every"],
                         max_seconds=config["training"]["max_seconds"],
                         collector={{name: config["collector"][name] for name in ("kind", "workers")}})
 stand_in.build_run = build_run
-stand_in.load_material = lambda config: None
-stand_in.run_material = lambda config, folder: None
-stand_in.build_evaluation = lambda run, material: None
+stand_in.load_dataset = lambda config: None
+stand_in.run_dataset = lambda config, folder: None
+stand_in.build_evaluation = lambda run, dataset: None
 sys.modules["egopose.pipeline"] = stand_in
 import egopose
 egopose.pipeline = stand_in

@@ -23,16 +23,16 @@ from egopose.models.feedback import BalanceFeedback
 from egopose.pipeline.agent import load_agent
 from egopose.pipeline.environment import build_env
 from egopose.pipeline.run import build_evaluation, build_run
-from egopose.tasks.dataset import Material
+from egopose.tasks.dataset import Dataset
 from egopose.training.loop import train
 
 
-def estimation_material() -> Material:
+def estimation_dataset() -> Dataset:
     humanoid: Any = stand_in()
     reference, takes = reference_motion(humanoid)
     generator = torch.Generator().manual_seed(0)
     frames = reference.shape[0]
-    return Material(
+    return Dataset(
         humanoid,
         reference,
         takes,
@@ -46,8 +46,8 @@ def estimation_material() -> Material:
 
 
 @pytest.fixture(scope="module")
-def material() -> Material:
-    return estimation_material()
+def dataset() -> Dataset:
+    return estimation_dataset()
 
 
 #: The stand-in's hinges turn about z, y, x.
@@ -69,21 +69,21 @@ def configuration(context: str = "frozen", **training: Any) -> dict[str, Any]:
             "context": {**model["context"], "source": context, "hidden_size": 4},
         },
         "algo": {**SETTINGS, "minibatch_size": 16, **{k: loop.pop(k) for k in ("iterations", "steps_per_iteration")}},
-        "collector": {**COLLECTOR, "worlds": 4},
-        "training": {**loop, "evaluation_worlds": 2, "evaluation_seed": 1},
+        "collector": {**COLLECTOR, "num_envs": 4},
+        "training": {**loop, "evaluation_num_envs": 2, "evaluation_seed": 1},
     }
 
 
 @pytest.mark.parametrize("context", ["frozen", "trainable"])
-def test_resumed_equals_uninterrupted_to_the_bit(context: str, material: Material, tmp_path: Path) -> None:
-    whole = build_run(configuration(context, evaluate_every=1), tmp_path / "whole", material)
-    train(whole, [], build_evaluation(whole, material))
-    half = build_run(configuration(context, evaluate_every=1, iterations=2), tmp_path / "half", material)
-    outcome = train(half, [], build_evaluation(half, material))
+def test_resumed_equals_uninterrupted_to_the_bit(context: str, dataset: Dataset, tmp_path: Path) -> None:
+    whole = build_run(configuration(context, evaluate_every=1), tmp_path / "whole", dataset)
+    train(whole, [], build_evaluation(whole, dataset))
+    half = build_run(configuration(context, evaluate_every=1, iterations=2), tmp_path / "half", dataset)
+    outcome = train(half, [], build_evaluation(half, dataset))
     torch.manual_seed(123)
-    again = build_run({**configuration(context, evaluate_every=1), "seed": 9}, tmp_path / "half", material)
+    again = build_run({**configuration(context, evaluate_every=1), "seed": 9}, tmp_path / "half", dataset)
     again.restore(outcome.checkpoint)
-    train(again, [], build_evaluation(again, material))
+    train(again, [], build_evaluation(again, dataset))
     for name, part in whole.checkpoint().components.items():
         if name in ("policy", "critic", "transforms", "simulation"):
             assert_equal(part.state_dict(), again.checkpoint().components[name].state_dict(), name)
@@ -99,16 +99,16 @@ def assert_equal(first: Any, second: Any, where: str) -> None:
 
 
 @pytest.fixture(scope="module")
-def trained(material: Material, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def trained(dataset: Dataset, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("trained")
-    run = build_run(configuration(), folder, material)
+    run = build_run(configuration(), folder, dataset)
     train(run, [])
     return folder
 
 
-def test_an_agent_is_what_was_trained(trained: Path, material: Material) -> None:
-    agent = load_agent(trained, material, which="latest")
-    env = agent.make_env(worlds=3)
+def test_an_agent_is_what_was_trained(trained: Path, dataset: Dataset) -> None:
+    agent = load_agent(trained, dataset, which="latest")
+    env = agent.make_env(num_envs=3)
     (normalizer,) = (m for m in env.transform.modules() if isinstance(m, StateNormalizer))
     assert normalizer.frozen
     assert normalizer.count > 100
@@ -119,17 +119,17 @@ def test_an_agent_is_what_was_trained(trained: Path, material: Material) -> None
     compare_states(agent.actor.state_dict(), weights, "policy")
 
 
-def test_an_agent_for_other_features_is_refused(trained: Path, material: Material) -> None:
-    wider = Material(**{**vars(material), "visual_context": torch.zeros(material.reference.shape[0], 7)})
+def test_an_agent_for_other_features_is_refused(trained: Path, dataset: Dataset) -> None:
+    wider = Dataset(**{**vars(dataset), "visual_context": torch.zeros(dataset.reference.shape[0], 7)})
     with pytest.raises(InputError, match=r"critic\..*has shape \[300, 158\] where \[300, 160\]"):
         load_agent(trained, wider, which="latest")
 
 
-def test_torchrl_evaluator_runs_it(trained: Path, material: Material) -> None:
-    agent = load_agent(trained, material, which="latest")
+def test_torchrl_evaluator_runs_it(trained: Path, dataset: Dataset) -> None:
+    agent = load_agent(trained, dataset, which="latest")
     layout = {"auto_register_policy_transforms": False, "traj_format": "padded"}  # TorchRL's next defaults differ
     evaluator = Evaluator(
-        agent.make_env(worlds=2), agent.actor, num_trajectories=2, max_steps=12, collector_kwargs=layout
+        agent.make_env(num_envs=2), agent.actor, num_trajectories=2, max_steps=12, collector_kwargs=layout
     )
     try:
         result = evaluator.evaluate()
@@ -138,25 +138,25 @@ def test_torchrl_evaluator_runs_it(trained: Path, material: Material) -> None:
     assert 0 < float(result["eval/reward"]) <= 12
 
 
-def test_what_a_policy_sees_is_built_in_order(material: Material) -> None:
+def test_what_a_policy_sees_is_built_in_order(dataset: Dataset) -> None:
     """The context and the tracking error of the raw state, which the normaliser changes last."""
-    env = build_env(configuration(), material, worlds=2)
+    env = build_env(configuration(), dataset, num_envs=2)
     kinds = [type(t) for t in env.transform]
     assert set(kinds) == {TrackingError, VisualContext, StateNormalizer}
     assert kinds[-1] is StateNormalizer
     (tracking,) = (t for t in env.transform if isinstance(t, TrackingError))
-    assert material.states is not None
-    assert torch.equal(tracking.table, material.states)
+    assert dataset.states is not None
+    assert torch.equal(tracking.table, dataset.states)
     # PIECES: frames 0-39 of the first take (at 0), 5-24 of the second (at 40).
-    seen = torch.cat([material.states[0:40], material.states[45:65]])
+    seen = torch.cat([dataset.states[0:40], dataset.states[45:65]])
     torch.testing.assert_close(tracking.scale, seen.std(dim=0).clamp_min(0.05))
     assert (tracking.scale == 0.05).any()
     assert (tracking.scale > 0.05).any()
 
 
-def test_starts_on_a_perfect_regressors_states_show_no_error(material: Material) -> None:
+def test_starts_on_a_perfect_regressors_states_show_no_error(dataset: Dataset) -> None:
     """Here the regressor's states are the reference's, where episodes start."""
-    env = build_env(configuration(), material, worlds=4)
+    env = build_env(configuration(), dataset, num_envs=4)
     td = env.reset()
     size = env.observation_spec["humanoid_state"].shape[-1]
     assert td["tracking_error"].shape == (4, 2 * size)
@@ -164,36 +164,36 @@ def test_starts_on_a_perfect_regressors_states_show_no_error(material: Material)
     assert td["tracking_error"][:, size:].abs().max() > 1e-2
 
 
-def test_training_moves_the_gains(trained: Path, material: Material) -> None:
-    agent = load_agent(trained, material, which="latest")
+def test_training_moves_the_gains(trained: Path, dataset: Dataset) -> None:
+    agent = load_agent(trained, dataset, which="latest")
     (feedback,) = (m for m in agent.actor.modules() if isinstance(m, BalanceFeedback))
     assert feedback.gains.shape == (3, 3)
     assert (feedback.gains != 0).all()
 
 
-def test_a_tracking_error_needs_the_regressors_states(material: Material) -> None:
+def test_a_tracking_error_needs_the_regressors_states(dataset: Dataset) -> None:
     with pytest.raises(InputError, match="trained state regressor") as caught:
-        build_env(configuration(), replace(material, states=None), worlds=1)
+        build_env(configuration(), replace(dataset, states=None), num_envs=1)
     assert caught.value.field == "model.inputs"
 
 
-def test_feedback_for_another_body_is_refused(material: Material, tmp_path: Path) -> None:
+def test_feedback_for_another_body_is_refused(dataset: Dataset, tmp_path: Path) -> None:
     config = configuration()
     config["model"]["feedback"] = {**config["model"]["feedback"], "roll": [["Tail_0"]]}
     with pytest.raises(InputError, match="Tail_0") as caught:
-        build_run(config, tmp_path, material)
+        build_run(config, tmp_path, dataset)
     assert caught.value.field == "feedback.roll"
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="starts processes")
 @pytest.mark.slow
-def test_two_processes_collect(material: Material, tmp_path: Path) -> None:
+def test_two_processes_collect(dataset: Dataset, tmp_path: Path) -> None:
     config = configuration(iterations=2)
     config["collector"] = {**config["collector"], "kind": "multi_sync", "workers": 2}
-    run = build_run(config, tmp_path, material)
+    run = build_run(config, tmp_path, dataset)
     try:
         outcome = train(run, [])
     finally:
         run.collector.shutdown()
     assert outcome.frames == 96
-    load_agent(outcome.checkpoint, material)
+    load_agent(outcome.checkpoint, dataset)

@@ -20,17 +20,17 @@ from egopose.models.recurrent import PastContext, collecting_policy, hidden_keys
 from egopose.pipeline.environment import build_env
 from egopose.pipeline.networks import build_networks
 from egopose.pipeline.run import build_evaluation, build_run
-from egopose.tasks.dataset import Material
+from egopose.tasks.dataset import Dataset
 from egopose.training.loop import train
 
 CONTEXT, HORIZON = 5, 8
 
 
-def forecasting_material() -> Material:
+def forecasting_dataset() -> Dataset:
     humanoid: Any = stand_in()
     reference, takes = reference_motion(humanoid)
     features = torch.randn(reference.shape[0], 6, generator=torch.Generator().manual_seed(0))
-    return Material(humanoid, reference, takes, PIECES, PIECES, visual_features=features)
+    return Dataset(humanoid, reference, takes, PIECES, PIECES, visual_features=features)
 
 
 def configuration(**training: Any) -> dict[str, Any]:
@@ -48,19 +48,19 @@ def configuration(**training: Any) -> dict[str, Any]:
             "memory": {"hidden_size": 7},
         },
         "algo": {**SETTINGS, "minibatch_size": 40, **{k: loop.pop(k) for k in ("iterations", "steps_per_iteration")}},
-        "collector": {**COLLECTOR, "worlds": 4},
-        "training": {**loop, "evaluation_worlds": 2, "evaluation_seed": 1},
+        "collector": {**COLLECTOR, "num_envs": 4},
+        "training": {**loop, "evaluation_num_envs": 2, "evaluation_seed": 1},
     }
 
 
 @pytest.fixture(scope="module")
-def material() -> Material:
-    return forecasting_material()
+def dataset() -> Dataset:
+    return forecasting_dataset()
 
 
 @pytest.fixture(scope="module")
-def run(material: Material, tmp_path_factory: pytest.TempPathFactory) -> Any:
-    return build_run(configuration(), tmp_path_factory.mktemp("run"), material)
+def run(dataset: Dataset, tmp_path_factory: pytest.TempPathFactory) -> Any:
+    return build_run(configuration(), tmp_path_factory.mktemp("run"), dataset)
 
 
 def test_sequences_give_what_steps_gave(run: Any) -> None:
@@ -135,31 +135,31 @@ def test_bootstrap_values_are_those_of_the_states_that_follow(run: Any) -> None:
     torch.testing.assert_close(batch["next", "state_value"], wanted, atol=1e-6, rtol=0)
 
 
-def test_resumed_equals_uninterrupted_to_the_bit(material: Material, tmp_path: Path) -> None:
-    whole = build_run(configuration(evaluate_every=1), tmp_path / "whole", material)
-    train(whole, [], build_evaluation(whole, material))
-    half = build_run(configuration(evaluate_every=1, iterations=2), tmp_path / "half", material)
-    outcome = train(half, [], build_evaluation(half, material))
-    again = build_run({**configuration(evaluate_every=1), "seed": 9}, tmp_path / "half", material)
+def test_resumed_equals_uninterrupted_to_the_bit(dataset: Dataset, tmp_path: Path) -> None:
+    whole = build_run(configuration(evaluate_every=1), tmp_path / "whole", dataset)
+    train(whole, [], build_evaluation(whole, dataset))
+    half = build_run(configuration(evaluate_every=1, iterations=2), tmp_path / "half", dataset)
+    outcome = train(half, [], build_evaluation(half, dataset))
+    again = build_run({**configuration(evaluate_every=1), "seed": 9}, tmp_path / "half", dataset)
     again.restore(outcome.checkpoint)
-    train(again, [], build_evaluation(again, material))
+    train(again, [], build_evaluation(again, dataset))
     for name in ("policy", "critic"):
         first, second = (r.checkpoint().components[name].state_dict() for r in (whole, again))
         assert all(torch.equal(first[key], second[key]) for key in first), name
 
 
-def test_episodes_begin_at_the_last_frame_of_a_context(material: Material) -> None:
+def test_episodes_begin_at_the_last_frame_of_a_context(dataset: Dataset) -> None:
     assert after_context([Piece(0, 10, 40), Piece(1, 0, 15), Piece(2, 0, 14)], 10, 6) == [(0, 19, 40), (1, 9, 15)]
-    env = build_env(configuration(), material, worlds=64)
+    env = build_env(configuration(), dataset, num_envs=64)
     start = env.reset()["episode_start"].squeeze(-1)
     # PIECES: frames 0-39 of the first take (at 0), 5-24 of the second (at 40).
     assert ((start >= CONTEXT - 1) & (start < 40) | (start >= 45 + CONTEXT - 1)).all()
 
 
-def test_the_context_is_of_the_past_alone_and_stays(material: Material, run: Any) -> None:
+def test_the_context_is_of_the_past_alone_and_stays(dataset: Dataset, run: Any) -> None:
     torch.manual_seed(0)
     network = ForwardContext(6, 4)
-    features = material.visual_features
+    features = dataset.visual_features
     assert features is not None
     bounds = torch.tensor([[0, 40], [40, 65]])
     context = PastContext(features, network, bounds, CONTEXT)
@@ -187,13 +187,11 @@ def test_the_context_is_of_the_past_alone_and_stays(material: Material, run: Any
         ("model", "context", {"source": "past", "horizon": 6}, "model.context"),
     ],
 )
-def test_what_knows_the_future_is_refused(
-    group_name: str, key: str, value: Any, field: str, material: Material
-) -> None:
+def test_what_knows_the_future_is_refused(group_name: str, key: str, value: Any, field: str, dataset: Dataset) -> None:
     config = configuration()
     config[group_name] = {**config[group_name], key: value}
     with pytest.raises(InputError) as caught:
-        build_env(config, material, worlds=1)
+        build_env(config, dataset, num_envs=1)
     assert caught.value.field == field
 
 
@@ -209,18 +207,18 @@ def test_the_reward_decays_with_time() -> None:
     torch.testing.assert_close(decayed, wanted)
 
 
-def test_the_time_left_follows_the_decay(material: Material) -> None:
-    env = build_env(configuration(), material, worlds=2, fragments=[Piece(0, 0, 40)], whole_fragments=True)
-    policy = collecting_policy(*build_networks(configuration(), material, env))
+def test_the_time_left_follows_the_decay(dataset: Dataset) -> None:
+    env = build_env(configuration(), dataset, num_envs=2, fragments=[Piece(0, 0, 40)], whole_fragments=True)
+    policy = collecting_policy(*build_networks(configuration(), dataset, env))
     batch = env.rollout(6, policy, break_when_any_done=False)
     torch.testing.assert_close(batch["time_left"][0, :, 0], 1 - torch.arange(6) / HORIZON)
     assert environment(2).observation_spec.get("time_left", None) is None
 
 
-def test_actions_may_be_relative_to_the_pose_an_episode_begins_with(material: Material) -> None:
+def test_actions_may_be_relative_to_the_pose_an_episode_begins_with(dataset: Dataset) -> None:
     config = configuration()
     config["task"] = {**config["task"], "action": {**config["task"]["action"], "reference": "start"}}
-    env = build_env(config, material, worlds=3)
+    env = build_env(config, dataset, num_envs=3)
     env.reset()
     base = env.base_env
     actions = torch.zeros(env.action_spec.shape)
@@ -232,7 +230,7 @@ def test_actions_may_be_relative_to_the_pose_an_episode_begins_with(material: Ma
     low, high = base.problem._range
     wanted = torch.clamp(begun + 0.05, low, high)
     torch.testing.assert_close(base.problem.target(action, base.frame, base.placed), wanted, atol=1e-7, rtol=0)
-    again = build_env(config, material, worlds=3).base_env
+    again = build_env(config, dataset, num_envs=3).base_env
     again.load_state_dict(base.state_dict())
     assert torch.equal(again.placed, base.placed)
     with pytest.raises(ValueError, match="placed"):
@@ -241,10 +239,10 @@ def test_actions_may_be_relative_to_the_pose_an_episode_begins_with(material: Ma
 
 @pytest.mark.skipif(sys.platform != "linux", reason="starts processes")
 @pytest.mark.slow
-def test_two_processes_collect_memories_too(material: Material, tmp_path: Path) -> None:
+def test_two_processes_collect_memories_too(dataset: Dataset, tmp_path: Path) -> None:
     config = configuration(iterations=3)
     config["collector"] = {**config["collector"], "kind": "multi_sync", "workers": 2}
-    run = build_run(config, tmp_path, material)
+    run = build_run(config, tmp_path, dataset)
     try:
         batches = iter(run.collector)
         next(batches)

@@ -19,17 +19,17 @@ from egopose.data.preparation import humanoid_of
 from egopose.motion.skeleton import Skeleton
 from egopose.training import body_parts as limb_finder
 from egopose.training.body_parts import (
-    FinderSettings,
-    FinderTraining,
+    BodyPartSettings,
+    BodyPartTraining,
     Pictures,
     held_out_figures,
     posture_mirror,
-    save_finder,
-    train_finder,
+    save_body_part_estimator,
+    train_body_part_estimator,
     varied,
 )
 from egopose.vision.body_part_pictures import posture_names
-from egopose.vision.body_parts import LIMBS, LimbFinder
+from egopose.vision.body_parts import LIMBS, BodyPartEstimator
 from egopose.vision.flow import FlowConfig
 
 WALK = Path(egopose.__file__).parent / "assets" / "clips" / "deepmimic_walk.motion.npz"
@@ -47,8 +47,8 @@ def skeleton(config: dict[str, Any]) -> Skeleton:
 
 
 @pytest.fixture(scope="module")
-def settings(config: dict[str, Any]) -> FinderSettings:
-    return FinderSettings.from_config(config["training"])
+def settings(config: dict[str, Any]) -> BodyPartSettings:
+    return BodyPartSettings.from_config(config["training"])
 
 
 @pytest.fixture(scope="module")
@@ -65,38 +65,42 @@ def data() -> Pictures:
     return Pictures(pictures, torch.zeros(48, 2, 32, 32, dtype=torch.float16), masks, posture)
 
 
-def test_a_short_training_lowers_the_loss(data: Pictures, skeleton: Skeleton, settings: FinderSettings) -> None:
-    work = FinderTraining(data, skeleton, replace(settings, epochs=15, batch=16, warm_up=3, learning_rate=0.01), seed=1)
+def test_a_short_training_lowers_the_loss(data: Pictures, skeleton: Skeleton, settings: BodyPartSettings) -> None:
+    work = BodyPartTraining(
+        data, skeleton, replace(settings, epochs=15, batch=16, warm_up=3, learning_rate=0.01), seed=1
+    )
     losses = [work.step() for _ in range(work.total_steps)]
     assert len(losses) == 45
     assert sum(losses[-3:]) < 0.6 * sum(losses[:3])
 
 
 def test_resumed_training_equals_one_that_was_never_stopped(
-    data: Pictures, skeleton: Skeleton, settings: FinderSettings, tmp_path: Path
+    data: Pictures, skeleton: Skeleton, settings: BodyPartSettings, tmp_path: Path
 ) -> None:
     few = replace(settings, epochs=1.5, save_every=5)
-    whole = train_finder(data, skeleton, few, seed=2)
+    whole = train_body_part_estimator(data, skeleton, few, seed=2)
 
     def stop(steps: int, total: int, loss: float) -> None:
         if steps == 10:
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        train_finder(data, skeleton, few, 2, tmp_path / "training", stop)
+        train_body_part_estimator(data, skeleton, few, 2, tmp_path / "training", stop)
     told: list[int] = []
-    parted = train_finder(data, skeleton, few, 2, tmp_path / "training", lambda steps, total, loss: told.append(steps))
+    parted = train_body_part_estimator(
+        data, skeleton, few, 2, tmp_path / "training", lambda steps, total, loss: told.append(steps)
+    )
     assert told == [15, 18]
     for key, value in whole.state_dict().items():
         torch.testing.assert_close(parted.state_dict()[key], value, rtol=0, atol=0)
-    other = train_finder(data, skeleton, few, seed=3)
+    other = train_body_part_estimator(data, skeleton, few, seed=3)
     assert not torch.equal(other.posture.weight, whole.posture.weight)
     with pytest.raises(InputError, match="training: settings: are another training's"):
-        train_finder(data, skeleton, replace(few, channels=16), 2, tmp_path / "training")
+        train_body_part_estimator(data, skeleton, replace(few, channels=16), 2, tmp_path / "training")
 
 
-def test_every_picture_comes_once_an_epoch(data: Pictures, skeleton: Skeleton, settings: FinderSettings) -> None:
-    work = FinderTraining(data, skeleton, replace(settings, batch=16), seed=1)
+def test_every_picture_comes_once_an_epoch(data: Pictures, skeleton: Skeleton, settings: BodyPartSettings) -> None:
+    work = BodyPartTraining(data, skeleton, replace(settings, batch=16), seed=1)
     seen = []
     for step in range(6):
         work.steps = step
@@ -106,7 +110,7 @@ def test_every_picture_comes_once_an_epoch(data: Pictures, skeleton: Skeleton, s
 
 
 def test_variants_keep_flow_masks_and_posture_of_one_side(
-    data: Pictures, skeleton: Skeleton, settings: FinderSettings
+    data: Pictures, skeleton: Skeleton, settings: BodyPartSettings
 ) -> None:
     mirror, generator = posture_mirror(skeleton), torch.Generator().manual_seed(4)
     sample = varied(data, mirror, replace(settings, gain=0.0, offset=0.0), generator)
@@ -119,9 +123,9 @@ def test_variants_keep_flow_masks_and_posture_of_one_side(
 
 
 def test_figures_are_one_for_the_truth_and_nought_for_the_mean(
-    data: Pictures, skeleton: Skeleton, settings: FinderSettings, monkeypatch: pytest.MonkeyPatch
+    data: Pictures, skeleton: Skeleton, settings: BodyPartSettings, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    model = FinderTraining(data, skeleton, settings, seed=1).model
+    model = BodyPartTraining(data, skeleton, settings, seed=1).model
     at = iter(range(0, 48, 16))
 
     def truth(before: torch.Tensor, now: torch.Tensor, flow: torch.Tensor) -> tuple[torch.Tensor, ...]:
@@ -141,17 +145,19 @@ def test_figures_are_one_for_the_truth_and_nought_for_the_mean(
 
 
 def test_a_finder_is_kept_without_pickle_and_comes_back(
-    data: Pictures, skeleton: Skeleton, settings: FinderSettings, tmp_path: Path
+    data: Pictures, skeleton: Skeleton, settings: BodyPartSettings, tmp_path: Path
 ) -> None:
-    model = FinderTraining(data, skeleton, settings, seed=1).model.eval()
-    folder = save_finder(tmp_path / "finder", model, skeleton, FlowConfig("fast", 64, 32), {"samples": 48}, 1)
-    made_with = read_json(folder, "config")
-    again = LimbFinder(made_with["numbers"], made_with["channels"])
+    model = BodyPartTraining(data, skeleton, settings, seed=1).model.eval()
+    folder = save_body_part_estimator(
+        tmp_path / "finder", model, skeleton, FlowConfig("fast", 64, 32), {"samples": 48}, 1
+    )
+    source_config = read_json(folder, "config")
+    again = BodyPartEstimator(source_config["numbers"], source_config["channels"])
     RunCheckpoint({"finder": again}).restore(folder)
     seen = data.pictures[:2, :3], data.pictures[:2, 3:], data.flow[:2]
     for mine, theirs in zip(model(*seen), again.eval()(*seen), strict=True):
         torch.testing.assert_close(mine, theirs, rtol=0, atol=0)
-    assert made_with["flow"] == {"preset": "fast", "working_size": 64, "stored_size": 32, "workers": 2}
+    assert source_config["flow"] == {"preset": "fast", "working_size": 64, "stored_size": 32, "workers": 2}
     assert read_json(folder, "card") == {"samples": 48}
     assert {path.suffix for path in folder.rglob("*") if path.is_file()} == {".json", ".memmap"}
 
@@ -160,24 +166,24 @@ def test_the_verb_draws_trains_keeps_and_does_nothing_twice(tmp_path: Path, monk
     tiny = ["pictures.samples=24", "pictures.rooms_a_part=1", "pictures.wearings=2", "pictures.pairs=6", "workers=1"]
     tiny += ["vision.room.texture_size=64", "training.held_out=0.25", "training.epochs=1"]
     values = compose_config("limbs", [f"motions=['{WALK}']", f"out={tmp_path / 'out'}", *SMALL, *tiny])
-    card = limbs.make_finder(values)
+    card = limbs.make_body_part_estimator(values)
     assert (card["samples"], card["held_out"]) == (24, 6)
     assert list(card["motions"]) == [WALK.name]
     assert set(card["figures"]["masks"]) == set(LIMBS)
     assert read_json(tmp_path / "out" / "finder", "card") == json.loads(json.dumps(card))
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["finder", "pictures"]
-    monkeypatch.setattr(limb_finder, "train_finder", lambda *_: pytest.fail("it is trained already"))
-    assert limbs.make_finder(values) == json.loads(json.dumps(card))
+    monkeypatch.setattr(limb_finder, "train_body_part_estimator", lambda *_: pytest.fail("it is trained already"))
+    assert limbs.make_body_part_estimator(values) == json.loads(json.dumps(card))
     values["training"]["epochs"] = 2
     with pytest.raises(InputError, match="finder of other settings"):
-        limbs.make_finder(values)
+        limbs.make_body_part_estimator(values)
 
 
 def test_settings_that_cannot_be_are_told(
-    config: dict[str, Any], data: Pictures, skeleton: Skeleton, settings: FinderSettings
+    config: dict[str, Any], data: Pictures, skeleton: Skeleton, settings: BodyPartSettings
 ) -> None:
     for name, value in (("batch", 0), ("channels", 12), ("epochs", 0), ("held_out", 1.0)):
         with pytest.raises(InputError, match=f"training: {name}: must"):
-            FinderSettings.from_config({**config["training"], name: value})
+            BodyPartSettings.from_config({**config["training"], name: value})
     with pytest.raises(InputError, match="batch: is 64, and there are 48"):
-        FinderTraining(data, skeleton, replace(settings, batch=64), 1)
+        BodyPartTraining(data, skeleton, replace(settings, batch=64), 1)

@@ -60,7 +60,7 @@ def test_killed_at_random_moments_it_ends_as_if_left_alone(rounds: int, capsys: 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["multi_sync", "multi_async", pytest.param("ray", marks=needs_ray)])
 def test_with_workers_nothing_is_lost_or_left(kind: str, capsys: pytest.CaptureFixture[str]) -> None:
-    result = killed(capsys, 3, f"collector={kind}", "collector.worlds=2")
+    result = killed(capsys, 3, f"collector={kind}", "collector.num_envs=2")
     assert (result["kills"], result["orphans"], result["iterations"]) == (3, 0, 15)
     assert (result["loaded_equal"], result["curves_whole"]) == (True, True)
     assert result["most_lost"] <= 2  # a checkpoint every second iteration

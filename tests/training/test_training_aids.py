@@ -12,7 +12,7 @@ from env_stand_in import PIECES, environment, group, problem
 from humanoid_stand_in import stand_in
 from hypothesis import given
 from hypothesis import strategies as st
-from test_training_pipeline import assert_equal, configuration, estimation_material
+from test_training_pipeline import assert_equal, configuration, estimation_dataset
 
 from egopose.core.config import compose_config
 from egopose.core.errors import InputError
@@ -23,7 +23,7 @@ from egopose.envs.starts import AdaptiveStarts
 from egopose.humanoid.physics import BatchedPhysics
 from egopose.pipeline.agent import load_agent
 from egopose.pipeline.run import build_evaluation, build_run
-from egopose.tasks.dataset import Material
+from egopose.tasks.dataset import Dataset
 from egopose.training.loop import iterate, train
 
 STARTS = AdaptiveStartSettings(bin=5, unit=3.0, rate=0.5, floor=0.2)
@@ -38,8 +38,8 @@ ALL_AIDS = {
 
 
 @pytest.fixture(scope="module")
-def material() -> Material:
-    return estimation_material()
+def dataset() -> Dataset:
+    return estimation_dataset()
 
 
 def adaptive(settings: AdaptiveStartSettings = STARTS, horizon: int = 15) -> AdaptiveStarts:
@@ -220,9 +220,7 @@ def test_workers_share_the_time_that_passes() -> None:
     assert env._taken(slice(0, 1)).tolist() == [6]
 
 
-def test_no_other_environment_than_the_collectors_is_aided(
-    material: Material, tmp_path: Path, monkeypatch: Any
-) -> None:
+def test_no_other_environment_than_the_collectors_is_aided(dataset: Dataset, tmp_path: Path, monkeypatch: Any) -> None:
     made: list[EgoPoseEnv] = []
     before = EgoPoseEnv.__init__
 
@@ -232,12 +230,12 @@ def test_no_other_environment_than_the_collectors_is_aided(
 
     monkeypatch.setattr(EgoPoseEnv, "__init__", remember)
     config = {**configuration(evaluate_every=1), "aids": ALL_AIDS}
-    run = build_run(config, tmp_path, material)
-    train(run, [], build_evaluation(run, material))
-    agent = load_agent(tmp_path, material)
+    run = build_run(config, tmp_path, dataset)
+    train(run, [], build_evaluation(run, dataset))
+    agent = load_agent(tmp_path, dataset)
     for split in ("train", "test"):
-        agent.make_env(split, worlds=2)
-        agent.make_env(split, worlds=2, whole_fragments=True)
+        agent.make_env(split, num_envs=2)
+        agent.make_env(split, num_envs=2, whole_fragments=True)
     aided = [env for env in made if env._assistance or env._falls or isinstance(env.starts, AdaptiveStarts)]
     assert len(aided) == 1
     assert aided[0] is run.collector.env.base_env
@@ -248,12 +246,12 @@ def test_no_other_environment_than_the_collectors_is_aided(
             assert env._head_drop(slice(None)) is None
 
 
-@pytest.mark.parametrize("lanes", [1, 2])
-def test_all_aids_resume_to_the_bit(lanes: int, material: Material, tmp_path: Path) -> None:
+@pytest.mark.parametrize("env_groups", [1, 2])
+def test_all_aids_resume_to_the_bit(env_groups: int, dataset: Dataset, tmp_path: Path) -> None:
     def make(name: str, seed: int = 5, **training: Any) -> Any:
         config = {**configuration(**training), "aids": ALL_AIDS, "seed": seed}
-        config["collector"] = {**config["collector"], "lanes": lanes}
-        return build_run(config, tmp_path / name, material)
+        config["collector"] = {**config["collector"], "env_groups": env_groups}
+        return build_run(config, tmp_path / name, dataset)
 
     whole = make("whole")
     train(whole, [])
@@ -264,12 +262,12 @@ def test_all_aids_resume_to_the_bit(lanes: int, material: Material, tmp_path: Pa
     for name in ("policy", "critic", "transforms", "simulation"):
         first, second = (run.checkpoint().components[name].state_dict() for run in (whole, again))
         assert_equal(first, second, name)
-    assert "survived" in whole.checkpoint().components["simulation"].state_dict()["worlds"]
+    assert "survived" in whole.checkpoint().components["simulation"].state_dict()["num_envs"]
 
 
-def test_sigma_shrinks_between_iterations_and_ppo_knows(material: Material, tmp_path: Path) -> None:
+def test_sigma_shrinks_between_iterations_and_ppo_knows(dataset: Dataset, tmp_path: Path) -> None:
     config = {**configuration(), "aids": {"sigma": {"sigma": 0.3, "steps": 96}}}
-    run = build_run(config, tmp_path, material)
+    run = build_run(config, tmp_path, dataset)
     seen: list[float] = []
     learn = run.ppo.update
 
@@ -306,11 +304,11 @@ def test_bad_aids_are_refused_by_name(aids: dict[str, Any], field: str) -> None:
     assert caught.value.field == field
 
 
-def test_a_learned_sigma_has_no_schedule(material: Material, tmp_path: Path) -> None:
+def test_a_learned_sigma_has_no_schedule(dataset: Dataset, tmp_path: Path) -> None:
     config = {**configuration(), "aids": {"sigma": {"sigma": 0.3, "steps": 96}}}
     config["model"] = {**config["model"], "learn_sigma": True}
     with pytest.raises(InputError, match=r"aids\.sigma"):
-        build_run(config, tmp_path, material)
+        build_run(config, tmp_path, dataset)
 
 
 @pytest.mark.parametrize("name", [p.stem for p in sorted((Path(__file__).parents[2] / "conf" / "aids").glob("*.yaml"))])

@@ -16,7 +16,7 @@ from toy_problem import SETTINGS, make_env, make_run, networks
 
 from egopose.core.errors import InputError
 from egopose.training.logging import CsvCurves, ProgressLine, build_loggers, git_state
-from egopose.training.loop import Run, experience_figures, iterate, train
+from egopose.training.loop import Run, batch_metrics, iterate, train
 from egopose.training.ppo import PPO, PPOSettings, TrainingDiverged, _between_neighbours
 
 
@@ -104,7 +104,7 @@ def test_a_fall_bootstraps_nothing_and_the_time_limit_does() -> None:
         parameter.data.zero_()
     list(critic.parameters())[-1].data.fill_(10.0)  # V = 10 everywhere
     ppo = PPO(actor, critic, PPOSettings.from_config({**SETTINGS, "normalize_advantage": False}))
-    env = make_env(worlds=2)
+    env = make_env(num_envs=2)
     batch = env.rollout(4, actor, break_when_any_done=False)
     reward = batch["next", "reward"]
     reward.fill_(1.0)
@@ -166,7 +166,7 @@ def test_figures_of_a_batch() -> None:
         },
         batch_size=[2, 3],
     )
-    figures = experience_figures(TensorDict({"next": after}, batch_size=[2, 3]))
+    figures = batch_metrics(TensorDict({"next": after}, batch_size=[2, 3]))
     assert figures == {
         "reward": 2.5,
         "reward_pose": 0.5,

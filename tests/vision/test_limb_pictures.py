@@ -35,7 +35,7 @@ from egopose.vision.body_part_pictures import (
     posture_names,
     read_pictures,
 )
-from egopose.vision.body_parts import FLOW, LIMBS, LimbFinder
+from egopose.vision.body_parts import FLOW, LIMBS, BodyPartEstimator
 from egopose.vision.flow import FlowConfig
 from egopose.vision.rendering import WEARER_CAMERA, camera_orientations
 from egopose.vision.rooms import room_seed
@@ -235,9 +235,9 @@ def test_parts_are_drawn_once_and_whole(scenes: Scenes, tmp_path: Path) -> None:
 def test_the_shipped_finder_finds_limbs_in_pictures_drawn_now(
     drawn: dict[str, np.ndarray], humanoid: HumanoidModel
 ) -> None:
-    made_with = read_json(SHIPPED, "config")
-    assert made_with["names"] == posture_names(humanoid.skeleton)
-    model = LimbFinder(made_with["numbers"], made_with["channels"])
+    source_config = read_json(SHIPPED, "config")
+    assert source_config["names"] == posture_names(humanoid.skeleton)
+    model = BodyPartEstimator(source_config["numbers"], source_config["channels"])
     RunCheckpoint({"finder": model}).restore(SHIPPED)
     figures = held_out_figures(model, as_pictures(drawn), humanoid.skeleton, 16)
     assert np.mean(list(figures["masks"].values())) > 0.5

@@ -16,14 +16,14 @@ from test_blended import KERNEL, blended
 from test_material import configuration, fill_flow
 
 from egopose.checkpoint import checkpoint
-from egopose.checkpoint.body_parts import load_finder
+from egopose.checkpoint.body_parts import load_body_part_estimator
 from egopose.core.config import compose_config, from_mapping
 from egopose.core.errors import InputError
 from egopose.data.preparation import flow_name, humanoid_of, prepare
 from egopose.data.store import TakeStore
 from egopose.inference.causal import CausalRegression
 from egopose.inference.stream.build import load_forecaster
-from egopose.inference.stream.frame_features import Sight
+from egopose.inference.stream.frame_features import FrameFeatures
 from egopose.models.blended import TimeWindows, blended_regressor, flow_cells, kernel_view
 from egopose.models.kernel_regression import KernelRegression
 from egopose.models.predictions import take_frames
@@ -32,18 +32,18 @@ from egopose.pipeline import regressor as regression
 from egopose.pipeline import regressor_input as sight
 from egopose.pipeline.regressor import kept_tables, load_regressor, regressor_name, regressor_tables
 from egopose.pipeline.regressor_input import (
-    FlowAndLimbs,
-    finder_fingerprint,
-    finder_of,
-    load_finder_of,
+    FlowAndBodyParts,
+    body_part_estimator_name,
+    body_part_fingerprint,
+    load_body_part_estimator_of,
     planes_of,
     seen_in_store,
 )
 from egopose.training import blended_regressor as blending
 from egopose.training.blended_regressor import KernelSettings
-from egopose.vision.body_parts import LimbFinder, as_plane, limb_rows, small_picture
+from egopose.vision.body_parts import BodyPartEstimator, as_plane, body_part_rows, small_picture
 from egopose.vision.encoders import LightFlowEncoder
-from egopose.vision.features import extract_flow, extract_limbs
+from egopose.vision.features import extract_body_parts, extract_flow
 from egopose.vision.flow import FlowConfig
 from egopose.vision.lens import Camera
 from egopose.vision.video import iter_frames
@@ -59,17 +59,17 @@ def _seed() -> None:
     torch.manual_seed(0)
 
 
-def finder_of_chance(numbers: int = 6, seed: int = 3) -> LimbFinder:
+def finder_of_chance(numbers: int = 6, seed: int = 3) -> BodyPartEstimator:
     """Untrained; that its answers are far apart for pictures that are is all that is wanted of it."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
-        finder = LimbFinder(numbers, 16).eval()
+        finder = BodyPartEstimator(numbers, 16).eval()
         finder.posture.weight.data *= 20.0
     return finder
 
 
 @pytest.fixture(scope="module")
-def finder() -> LimbFinder:
+def finder() -> BodyPartEstimator:
     return finder_of_chance()
 
 
@@ -93,15 +93,15 @@ def test_a_small_picture_is_the_area_mean_of_the_centred_square(height: int, wid
 
 
 def test_each_row_is_of_a_frame_and_the_one_before_in_whatever_batch(
-    finder: LimbFinder, monkeypatch: pytest.MonkeyPatch
+    finder: BodyPartEstimator, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     draw = np.random.default_rng(1)
     pictures = draw.integers(0, 256, (9, 64, 64, 3), dtype=np.uint8)
     flow = (0.05 * draw.normal(size=(9, 2, 32, 32))).astype(np.float16)
-    rows = limb_rows(finder, pictures, flow)
+    rows = body_part_rows(finder, pictures, flow)
     assert rows.dtype == np.float16
     monkeypatch.setattr("egopose.vision.body_parts._BATCH", 4)
-    np.testing.assert_allclose(limb_rows(finder, list(pictures), flow), rows, atol=4e-3)
+    np.testing.assert_allclose(body_part_rows(finder, list(pictures), flow), rows, atol=4e-3)
     for frame, before in ((0, 0), (1, 0), (4, 3), (8, 7)):
         pair = (torch.from_numpy(pictures[i]).permute(2, 0, 1)[None] for i in (before, frame))
         with torch.no_grad():
@@ -110,13 +110,13 @@ def test_each_row_is_of_a_frame_and_the_one_before_in_whatever_batch(
     assert np.abs(np.diff(rows[:, :6].astype(float), axis=0)).max() > 0.1
 
 
-def test_flow_of_another_size_is_brought_to_the_finders(finder: LimbFinder) -> None:
+def test_flow_of_another_size_is_brought_to_the_finders(finder: BodyPartEstimator) -> None:
     pictures = np.random.default_rng(2).integers(0, 256, (3, 64, 64, 3), dtype=np.uint8)
     coarse = (0.05 * np.random.default_rng(3).normal(size=(6, 4, 4))).astype(np.float32)
     large, small = (np.stack([cv2.resize(c, (n, n)) for c in coarse]).reshape(3, 2, n, n) for n in (64, 32))
-    wanted = limb_rows(finder, pictures, small)
-    np.testing.assert_allclose(limb_rows(finder, pictures, large), wanted, atol=0.03)
-    assert np.abs(limb_rows(finder, pictures, -large) - wanted).max() > 0.3
+    wanted = body_part_rows(finder, pictures, small)
+    np.testing.assert_allclose(body_part_rows(finder, pictures, large), wanted, atol=0.03)
+    assert np.abs(body_part_rows(finder, pictures, -large) - wanted).max() > 0.3
 
 
 def test_rows_fill_a_plane_in_reading_order() -> None:
@@ -132,7 +132,7 @@ def test_rows_fill_a_plane_in_reading_order() -> None:
 
 def test_flow_and_limbs_read_as_one_table() -> None:
     flow, rows = torch.randn(20, 2, 4, 4).half(), torch.randn(20, 7).half()
-    table = FlowAndLimbs(flow, rows)
+    table = FlowAndBodyParts(flow, rows)
     whole = np.concatenate([flow, as_plane(rows.numpy(), 4)], axis=1)
     assert (len(table), table.ndim) == (20, 4)
     for frames in (slice(None), slice(3, 9), np.array([7, 2, 2, 19])):
@@ -144,10 +144,12 @@ def test_flow_and_limbs_read_as_one_table() -> None:
 
 
 @pytest.mark.parametrize("camera", [None, CAMERA])
-def test_flow_with_limbs_is_flow_and_the_limbs_beside_it(finder: LimbFinder, walk: Path, camera: Camera | None) -> None:
+def test_flow_with_limbs_is_flow_and_the_limbs_beside_it(
+    finder: BodyPartEstimator, walk: Path, camera: Camera | None
+) -> None:
     offset = 0.0 if camera is None else 0.5 * camera.readout
     flow = extract_flow(walk, FLOW, 30.0, offset, camera=camera)
-    rows = extract_limbs(walk, flow, FLOW, finder, 30.0, offset, camera)
+    rows = extract_body_parts(walk, flow, FLOW, finder, 30.0, offset, camera)
     both = extract_flow(walk, FLOW, 30.0, offset, camera=camera, finder=finder)
     assert (both.shape, both.dtype) == ((12, 3, 32, 32), np.float16)
     np.testing.assert_array_equal(both, np.concatenate([flow, as_plane(rows, 32)], axis=1))
@@ -156,20 +158,20 @@ def test_flow_with_limbs_is_flow_and_the_limbs_beside_it(finder: LimbFinder, wal
     if camera is not None:
         seen = camera.rectifier(frames[0].shape[1], frames[0].shape[0], FLOW.working_size)
         frames = [seen(frame) for frame in frames]
-    np.testing.assert_array_equal(rows, limb_rows(finder, [small_picture(frame) for frame in frames], flow))
+    np.testing.assert_array_equal(rows, body_part_rows(finder, [small_picture(frame) for frame in frames], flow))
     if camera is not None:
-        bent = extract_limbs(walk, flow, FLOW, finder, 30.0, 0.0, None)
+        bent = extract_body_parts(walk, flow, FLOW, finder, 30.0, 0.0, None)
         assert np.abs(bent - rows).max() > 0.1, "the lens is undone before limbs are looked for"
 
 
 @pytest.mark.parametrize(("camera", "side"), [(None, 32), (CAMERA, 64)])
 def test_live_the_limbs_are_those_seen_offline(
-    finder: LimbFinder, walk: Path, camera: Camera | None, side: int
+    finder: BodyPartEstimator, walk: Path, camera: Camera | None, side: int
 ) -> None:
     flow = replace(FLOW, stored_size=side)
     offset = 0.0 if camera is None else 0.5 * camera.readout
     offline = extract_flow(walk, flow, 30.0, offset, camera=camera, finder=finder)
-    live = Sight(None, flow, camera or Camera(), 30.0, finder)
+    live = FrameFeatures(None, flow, camera or Camera(), 30.0, finder)
     seen = np.stack([live.flow(image, t / 30) for t, image in enumerate(iter_frames(walk, 30.0))])
     assert seen.dtype == np.float32
     np.testing.assert_allclose(seen[:, :2], offline[:, :2], atol=1e-3)
@@ -178,10 +180,12 @@ def test_live_the_limbs_are_those_seen_offline(
     assert np.abs(np.diff(offline[:, 2].astype(float), axis=0)).max() > 0.2
 
 
-def test_live_a_source_that_comes_back_in_another_size_has_no_picture_before(finder: LimbFinder, walk: Path) -> None:
+def test_live_a_source_that_comes_back_in_another_size_has_no_picture_before(
+    finder: BodyPartEstimator, walk: Path
+) -> None:
     frames = list(iter_frames(walk, 30.0))
     other = cv2.resize(frames[9], (160, 160))
-    live, fresh = (Sight(None, FLOW, Camera(), 30.0, finder) for _ in range(2))
+    live, fresh = (FrameFeatures(None, FLOW, Camera(), 30.0, finder) for _ in range(2))
     for t in range(3):
         live.flow(frames[t], t / 30)
     np.testing.assert_array_equal(live.flow(other, 0.1), fresh.flow(other, 0.0))
@@ -282,36 +286,36 @@ def test_frame_by_frame_limbs_are_what_the_video_up_to_there_shows() -> None:
 
 
 def test_a_regressor_sees_limbs_only_where_its_kernel_names_a_finder() -> None:
-    assert finder_of({}) is None
-    assert finder_of({"kernel": None}) is None
-    assert finder_of({"kernel": KERNEL}) is None, "regressors from before there were finders"
+    assert body_part_estimator_name({}) is None
+    assert body_part_estimator_name({"kernel": None}) is None
+    assert body_part_estimator_name({"kernel": KERNEL}) is None, "regressors from before there were finders"
     assert from_mapping(KernelSettings, KERNEL, "x").limb_numbers == 0
     assert planes_of({"kernel": KERNEL}) == 2
-    assert load_finder_of({"kernel": KERNEL}) is None
+    assert load_body_part_estimator_of({"kernel": KERNEL}) is None
     chosen = compose_config("train", ["regressor=blended"])["regressor"]
-    assert (finder_of(chosen), planes_of(chosen)) == ("limbs", 3)
-    finder = load_finder("limbs")
-    assert load_finder_of(chosen) is finder
+    assert (body_part_estimator_name(chosen), planes_of(chosen)) == ("limbs", 3)
+    finder = load_body_part_estimator("limbs")
+    assert load_body_part_estimator_of(chosen) is finder
     assert from_mapping(KernelSettings, chosen["kernel"], "x").limb_numbers == 2 * finder.numbers
     assert not finder.training
     for name in ("none-such", "cmu6_estimation/..", ""):
         with pytest.raises(InputError, match="no limb finder"):
-            load_finder(name)
+            load_body_part_estimator(name)
 
 
 def test_the_regressors_name_tells_what_it_saw_limbs_with(monkeypatch: pytest.MonkeyPatch) -> None:
     config, store = compose_config("train", ["regressor=blended"]), SimpleNamespace(fingerprint="f")
     without = compose_config("train", ["regressor=blended", "regressor.kernel.limbs=null"])
     names = [regressor_name(one, store, "flow") for one in (config, without)]
-    monkeypatch.setattr(sight, "load_finder", lambda _: finder_of_chance(seed=4))
+    monkeypatch.setattr(sight, "load_body_part_estimator", lambda _: finder_of_chance(seed=4))
     names += [regressor_name(one, store, "flow") for one in (config, without)]
     assert len(set(names)) == 3
     assert names[1] == names[3], "without limbs it is nobody's affair what the finder is"
     other = finder_of_chance(seed=4)
     other.posture.bias.data[0] += 1e-3
-    before = finder_fingerprint("limbs")
-    monkeypatch.setattr(sight, "load_finder", lambda _: other)
-    assert finder_fingerprint("limbs") != before
+    before = body_part_fingerprint("limbs")
+    monkeypatch.setattr(sight, "load_body_part_estimator", lambda _: other)
+    assert body_part_fingerprint("limbs") != before
 
 
 def test_a_live_forecast_needs_the_limbs_of_the_estimating_run(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -321,11 +325,14 @@ def test_a_live_forecast_needs_the_limbs_of_the_estimating_run(monkeypatch: pyte
     run["model"] = {**run["model"], "context": {**run["model"]["context"], "source": "past"}}
     monkeypatch.setattr(checkpoint, "find_checkpoint", lambda *_: Path("forecasts"))
     monkeypatch.setattr(checkpoint, "read_json", lambda *_: run)
-    monkeypatch.setattr(regression, "load_regressor", lambda _: (trained.regressor, trained.made_with))
+    monkeypatch.setattr(regression, "load_regressor", lambda _: (trained.regressor, trained.source_config))
     chosen = compose_config("stream", ["source=none", "checkpoint=none", "forecast.checkpoint=forecasts"])
-    seeing = {**trained.made_with, "regressor": {**trained.made_with["regressor"], "kernel": {"limbs": "limbs"}}}
+    seeing = {
+        **trained.source_config,
+        "regressor": {**trained.source_config["regressor"], "kernel": {"limbs": "limbs"}},
+    }
     with pytest.raises(InputError, match=r"regressor\.kernel\.limbs"):
-        load_forecaster(chosen, replace(trained, made_with=seeing))
+        load_forecaster(chosen, replace(trained, source_config=seeing))
 
 
 # --- in a store ------------------------------------------------------------------------------------------------------
@@ -340,7 +347,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_a_store_keeps_the_finders_rows_and_its_regressor_is_read_back(
-    folder: Path, finder: LimbFinder, monkeypatch: pytest.MonkeyPatch
+    folder: Path, finder: BodyPartEstimator, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     config = blended(folder)
     config["regressor"]["kernel"] = {**KERNEL, "limbs": "limbs"}
@@ -355,8 +362,8 @@ def test_a_store_keeps_the_finders_rows_and_its_regressor_is_read_back(
         return known[store.frames(take)].numpy()
 
     for module in (sight, blending):
-        monkeypatch.setattr(module, "load_finder", lambda _: finder)
-    monkeypatch.setattr("egopose.vision.features.extract_limbs", rows_of)
+        monkeypatch.setattr(module, "load_body_part_estimator", lambda _: finder)
+    monkeypatch.setattr("egopose.vision.features.extract_body_parts", rows_of)
     wanted = np.concatenate([store.flow(flow), as_plane(known.numpy(), 8)], axis=1)
     there = {path.name for path in (store.root / "tables").glob("*")}
     np.testing.assert_array_equal(seen_in_store(config, config["regressor"], store, flow)[:], wanted)
@@ -373,8 +380,8 @@ def test_a_store_keeps_the_finders_rows_and_its_regressor_is_read_back(
     np.testing.assert_array_equal(seen_in_store(config, config["regressor"], store, flow)[:], wanted)
     assert not asked, "the table is read"
 
-    model, made_with = load_regressor(weights)
-    assert planes_of(made_with["regressor"]) == 3
+    model, source_config = load_regressor(weights)
+    assert planes_of(source_config["regressor"]) == 3
     assert model.encoder.limbs == 2 * finder.numbers
     monkeypatch.setattr(regression, "_is_trained", lambda *_: False)  # so that it predicts anew
     again, _ = kept_tables(config, store, humanoid, flow, weights)
@@ -383,6 +390,6 @@ def test_a_store_keeps_the_finders_rows_and_its_regressor_is_read_back(
         tail = slice(take.offset + round(take.length / 2), take.offset + take.length)
         torch.testing.assert_close(again["humanoid_state"][tail], tables["humanoid_state"][tail])
 
-    monkeypatch.setattr(sight, "load_finder", lambda _: finder_of_chance(seed=4))
+    monkeypatch.setattr(sight, "load_body_part_estimator", lambda _: finder_of_chance(seed=4))
     seen_in_store(config, config["regressor"], store, flow)
     assert asked == list(range(len(store.takes))), "other weights, other rows"

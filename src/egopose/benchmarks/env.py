@@ -9,7 +9,7 @@ from egopose.benchmarks.raw_replay import compare_with_raw
 from egopose.collection.collectors import CollectorSettings, base_env, build_collector, set_threads
 from egopose.core.config import compose_config
 from egopose.core.runtime import settle_heap
-from egopose.pipeline.dataset import motion_material
+from egopose.pipeline.dataset import motion_dataset
 from egopose.pipeline.environment import build_env
 from egopose.pipeline.networks import build_networks
 
@@ -21,7 +21,7 @@ def run(overrides: Sequence[str], rounds: int) -> dict[str, Any]:
     normaliser and TorchRL's collector, on the default clips. The context is noise: its values cost nothing.
 
     Args:
-        overrides: of the training configuration (``sim=fast collector.worlds=32``).
+        overrides: of the training configuration (``sim=fast collector.num_envs=32``).
         rounds: interleaved; the median counts.
 
     Returns:
@@ -31,11 +31,11 @@ def run(overrides: Sequence[str], rounds: int) -> dict[str, Any]:
         InputError: a setting is unknown or out of range.
     """
     config = compose_config("train", ["sim=paper", *overrides])
-    material = motion_material(config)
+    dataset = motion_dataset(config)
     settings = CollectorSettings.from_config(config["collector"])
     set_threads(settings.threads)
-    env = build_env(config, material, worlds=settings.worlds, threads=settings.physics_threads)
-    actor, _ = build_networks(config, material, env)
+    env = build_env(config, dataset, num_envs=settings.num_envs, threads=settings.physics_threads)
+    actor, _ = build_networks(config, dataset, env)
     collector = build_collector(settings, lambda _: env, actor, int(config["algo"]["steps_per_iteration"]))
     settle_heap()
     try:

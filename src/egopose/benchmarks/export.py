@@ -48,13 +48,13 @@ def run(overrides: Sequence[str], rounds: int) -> dict[str, Any]:
     clip, _ = reference_motion(read_motion(_CLIP), humanoid)
     chosen = {key: value for key, value in settings.items() if key not in ("enabled", "humanoid")}
     motion = with_forces(humanoid, clip, from_mapping(ForceSettings, chosen, "conf/export.yaml: forces"))
-    found: dict[str, dict[str, Any]] = {}
+    result: dict[str, dict[str, Any]] = {}
     for _ in range(rounds):
         with TemporaryDirectory() as folder:
             for ending, errors in round_trips(humanoid, motion, Path(folder)).items():
-                before = found.setdefault(ending, errors)
-                found[ending] = {k: max(v, before[k]) if isinstance(v, float) else v for k, v in errors.items()}
-    return {**found, "table": "\n" + as_markdown(found)}
+                before = result.setdefault(ending, errors)
+                result[ending] = {k: max(v, before[k]) if isinstance(v, float) else v for k, v in errors.items()}
+    return {**result, "table": "\n" + as_markdown(result)}
 
 
 def round_trips(humanoid: HumanoidModel, motion: Motion, folder: Path) -> dict[str, dict[str, Any]]:

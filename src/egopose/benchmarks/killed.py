@@ -19,7 +19,7 @@ import torch
 from egopose.checkpoint.checkpoint import read_json
 from egopose.collection.collectors import transform_state
 from egopose.collection.workers import Workers
-from egopose.pipeline.dataset import motion_material
+from egopose.pipeline.dataset import motion_dataset
 from egopose.pipeline.training import run_job
 from egopose.training import loop
 from egopose.training.ppo import PPO
@@ -72,7 +72,7 @@ def train_or_go_on(config: dict[str, Any], folder: Path, number: int) -> None:
     server: Any = multiprocessing.forkserver._forkserver
     server.ensure_running = lambda: None
     _observe(Notes(folder.with_suffix(NOTES)), number)
-    run_job(config, folder, motion_material(config))
+    run_job(config, folder, motion_dataset(config))
 
 
 def _observe(notes: Notes, number: int) -> None:

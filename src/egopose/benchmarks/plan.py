@@ -15,7 +15,7 @@ from egopose.envs.mdp.observations import humanoid_state
 from egopose.envs.test_time import prepare_for_test
 from egopose.inference.planner import Planner
 from egopose.inference.planner_settings import planner_settings
-from egopose.pipeline.dataset import motion_material
+from egopose.pipeline.dataset import motion_dataset
 from egopose.pipeline.environment import build_env
 from egopose.pipeline.networks import build_networks
 
@@ -43,15 +43,15 @@ def run(overrides: Sequence[str], rounds: int) -> dict[str, Any]:
     assert settings is not None  # the default is a planner, and only its values change here
     threads = int(config["collector"]["physics_threads"])
     torch.set_num_threads(1)
-    material = motion_material(config)
+    dataset = motion_dataset(config)
     options: dict[str, Any] = {"threads": threads, "whole_fragments": True, "falls_end": False}
-    env = build_env(config, material, worlds=1, **options)
-    copies = build_env(config, material, worlds=settings.samples, **options)
-    actor, critic = build_networks(config, material, env)
+    env = build_env(config, dataset, num_envs=1, **options)
+    copies = build_env(config, dataset, num_envs=settings.samples, **options)
+    actor, critic = build_networks(config, dataset, env)
     for one in (env, copies):
         prepare_for_test(one, actor, critic)
     env.reset()
-    states = humanoid_state(material.reference).float()
+    states = humanoid_state(dataset.reference).float()
     planner = Planner(copies, actor, critic, states, settings)
     base, physics = env.base_env, copies.base_env.physics
     recorder, replay = StepRecorder(physics), RawReplay(physics)
@@ -62,7 +62,7 @@ def run(overrides: Sequence[str], rounds: int) -> dict[str, Any]:
         recorder.clear()
         began, cpu = time.perf_counter(), time.process_time()
         for _ in range(frames):
-            planner.addition(base)
+            planner.perturbation(base)
         between, cpu_between = time.perf_counter(), time.process_time()
         seconds = replay.run(recorder.states, recorder.ctrls)
         planned.append(1e3 * (between - began) / frames)

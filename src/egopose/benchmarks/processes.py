@@ -14,21 +14,21 @@ Process = tuple[int, int]
 
 def family(root: int) -> set[Process]:
     """All that ``root`` and what it started have started and that has not ended; without ``root``."""
-    found = _processes()
+    result = _processes()
     known, grown = {root}, True
     while grown:
-        more = {pid for pid, (parent, _) in found.items() if parent in known} - known
+        more = {pid for pid, (parent, _) in result.items() if parent in known} - known
         known |= more
         grown = bool(more)
-    return {(pid, found[pid][1]) for pid in known if pid != root and pid in found}
+    return {(pid, result[pid][1]) for pid in known if pid != root and pid in result}
 
 
 def end_of(left: set[Process], seconds: float) -> tuple[float, set[Process]]:
     """Wait for processes to end; s until the last had, or until there was no more patience, and those left then."""
     begin = time.monotonic()
     while left:
-        found = _processes()
-        left = {process for process in left if found.get(process[0], (0, -1))[1] == process[1]}
+        result = _processes()
+        left = {process for process in left if result.get(process[0], (0, -1))[1] == process[1]}
         if not left or time.monotonic() - begin > seconds:
             break
         time.sleep(0.02)
@@ -37,20 +37,20 @@ def end_of(left: set[Process], seconds: float) -> tuple[float, set[Process]]:
 
 def of_commands(processes: set[Process], *words: str) -> set[Process]:
     """Those whose command line has one of the words in it."""
-    found = set()
+    result = set()
     for process in processes:
         with suppress(OSError):  # it has ended meanwhile
             line = Path(f"/proc/{process[0]}/cmdline").read_bytes().decode(errors="replace")
             if any(word in line for word in words):
-                found.add(process)
-    return found
+                result.add(process)
+    return result
 
 
 def kill(processes: set[Process]) -> None:
     """SIGKILL to each that is still there."""
-    found = _processes()
+    result = _processes()
     for pid, start in processes:
-        if found.get(pid, (0, -1))[1] == start:
+        if result.get(pid, (0, -1))[1] == start:
             with suppress(ProcessLookupError):
                 os.kill(pid, signal.SIGKILL)
 

@@ -30,7 +30,7 @@ class StepRecorder:
         def recorded(ctrl: Array, worlds: slice, wrench: Array | None) -> Any:
             parts.append((self.physics.state[worlds].copy(), ctrl.copy()))
             # Ranges of worlds take turns, in order.
-            if sum(len(part) for _, part in parts) == self.physics.n_worlds:
+            if sum(len(part) for _, part in parts) == self.physics.num_envs:
                 for record, columns in zip((self.states, self.ctrls), zip(*parts, strict=True), strict=True):
                     record.append(np.concatenate(columns))
                 parts.clear()
@@ -53,8 +53,8 @@ class RawReplay:
 
     def __init__(self, physics: BatchedPhysics) -> None:
         self._model, self._substeps = physics.model, physics.substeps
-        self._warm_starts = np.zeros((physics.n_worlds, physics.model.nv))
-        self._shares = [list(part) for part in np.array_split(np.arange(physics.n_worlds), physics.threads)]
+        self._warm_starts = np.zeros((physics.num_envs, physics.model.nv))
+        self._shares = [list(part) for part in np.array_split(np.arange(physics.num_envs), physics.threads)]
         self._pool = ThreadPoolExecutor(physics.threads)
 
     def run(self, states: list[Array], ctrls: list[Array]) -> float:
@@ -100,7 +100,7 @@ def compare_with_raw(batches: Iterator[Any], physics: BatchedPhysics, rounds: in
         start, cpu = time.perf_counter(), time.process_time()
         next(batches)
         elapsed, between = time.perf_counter() - start, time.process_time()
-        steps = len(recorder.states) * physics.n_worlds
+        steps = len(recorder.states) * physics.num_envs
         loop_rates.append(steps / elapsed)
         raw_rates.append(steps / replay.run(recorder.states, recorder.ctrls))
         cpu_ratios.append((time.process_time() - between) / (between - cpu))
@@ -111,7 +111,7 @@ def compare_with_raw(batches: Iterator[Any], physics: BatchedPhysics, rounds: in
         "control_steps_per_s": statistics.median(loop_rates),
         "raw_steps_per_s": statistics.median(raw_rates),
         "substeps": physics.substeps,
-        "worlds": physics.n_worlds,
+        "num_envs": physics.num_envs,
         "threads": physics.threads,
         "rounds": rounds,
     }

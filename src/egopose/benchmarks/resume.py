@@ -21,12 +21,12 @@ from egopose.benchmarks.killed import LOADED, NOTES, PHASES, Notes, content, tra
 from egopose.checkpoint.checkpoint import FOLDER, find_checkpoint
 from egopose.core.config import compose_config
 from egopose.core.errors import InputError
-from egopose.pipeline.dataset import motion_material
+from egopose.pipeline.dataset import motion_dataset
 from egopose.training.logging import CURVES
 
 #: A whole training made small: what is lost or altered by a kill does not depend on the size.
 SMALL = (
-    "collector.worlds=4",
+    "collector.num_envs=4",
     "collector.physics_threads=1",
     "collector.update_threads=1",
     "algo.steps_per_iteration=64",
@@ -80,7 +80,7 @@ def run(overrides: Sequence[str], rounds: int) -> dict[str, Any]:
     # A start gets two done on average, less what its kill loses: so it does not come to its end before the last kill.
     iterations = f"algo.iterations={3 * rounds + 6}"
     config = compose_config("train", [*SMALL, iterations, *overrides])
-    motion_material(config)  # prepares the data where that has not been done yet
+    motion_dataset(config)  # prepares the data where that has not been done yet
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload(
         ["egopose.train", "egopose.pipeline", "egopose.training.loop", "egopose.benchmarks.killed", "torch.utils.data"]

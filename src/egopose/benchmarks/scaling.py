@@ -26,7 +26,7 @@ from torchrl.envs import EnvBase
 from egopose.benchmarks.process_memory import mapped_mb, private_mb, proportional_mb
 from egopose.collection.collectors import CollectorSettings, base_env, build_collector, set_threads
 from egopose.core.config import compose_config
-from egopose.pipeline.dataset import motion_material
+from egopose.pipeline.dataset import motion_dataset
 from egopose.pipeline.environment import build_env
 from egopose.pipeline.networks import build_networks
 from egopose.training.ppo import PPO, PPOSettings
@@ -64,34 +64,34 @@ def run(overrides: Sequence[str], rounds: int) -> dict[str, Any]:
         InputError: a setting is unknown or out of range.
     """
     config = compose_config("train", ["collector=multi_sync", "collector.update_threads=1", *overrides])
-    material = motion_material(config)
+    dataset = motion_dataset(config)
     settings = CollectorSettings.from_config(config["collector"])
     algo = config["algo"]
-    make_env = partial(_make_env, config, material)
+    make_env = partial(_make_env, config, dataset)
     set_threads(settings.threads)
 
     out: dict[str, Any] = {
-        "worlds": settings.worlds,
+        "num_envs": settings.num_envs,
         "epochs": int(algo["epochs"]),
         "minibatch_size": algo["minibatch_size"],
         "steps_per_iteration": int(algo["steps_per_iteration"]),
     }
-    env = make_env(settings.worlds, 0)
+    env = make_env(settings.num_envs, 0)
     torch.manual_seed(0)
-    actor, critic = build_networks(config, material, env)
+    actor, critic = build_networks(config, dataset, env)
     out["substeps"] = env.base_env.physics.substeps
     out["problem_frame_bytes"] = _own_frame_bytes(env.base_env.problem)
     out |= _collection(make_env, actor)
     ppo = PPO(actor, critic, PPOSettings.from_config(algo))
-    batch = _batch(make_env, actor, int(algo["steps_per_iteration"]), settings.worlds)
+    batch = _batch(make_env, actor, int(algo["steps_per_iteration"]), settings.num_envs)
     out |= _transfer(batch)
     out |= _learning(ppo, batch, rounds)
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "features.memmap"
-        width = material.visual_context.shape[1]  # type: ignore[union-attr]
+        width = dataset.visual_context.shape[1]  # type: ignore[union-attr]
         table = MemoryMappedTensor.zeros((_FEATURE_ROWS, width), dtype=torch.float32, filename=str(file))
         out["features_mb"] = file.stat().st_size / 2**20
-        mapped = partial(_make_env, config, replace(material, visual_context=table))
+        mapped = partial(_make_env, config, replace(dataset, visual_context=table))
         for count in _POOLS:
             out |= _workers(count, replace(settings, workers=count), mapped, ppo, file, out, rounds)
     for kind in ("sync", "multi_async"):
@@ -101,11 +101,11 @@ def run(overrides: Sequence[str], rounds: int) -> dict[str, Any]:
     return out
 
 
-def _make_env(config: Mapping[str, Any], material: Any, worlds: int, number: int) -> EnvBase:
+def _make_env(config: Mapping[str, Any], dataset: Any, num_envs: int, number: int) -> EnvBase:
 
     # Every row is read, as in hours of training.
-    float(material.visual_context.sum())
-    return build_env(config, material, worlds=worlds, threads=1, seed=number)
+    float(dataset.visual_context.sum())
+    return build_env(config, dataset, num_envs=num_envs, threads=1, seed=number)
 
 
 def _own_frame_bytes(problem: Any) -> float:
@@ -181,14 +181,14 @@ def _collection(make_env: Callable[[int, int], EnvBase], actor: Any) -> dict[str
     }
 
 
-def _sync(worlds: int) -> Any:
+def _sync(num_envs: int) -> Any:
 
-    return CollectorSettings("sync", worlds, 1, 1, 1, 1)
+    return CollectorSettings("sync", num_envs, 1, 1, 1, 1)
 
 
-def _batch(make_env: Callable[[int, int], EnvBase], actor: Any, steps: int, worlds: int) -> TensorDictBase:
+def _batch(make_env: Callable[[int, int], EnvBase], actor: Any, steps: int, num_envs: int) -> TensorDictBase:
 
-    collector = build_collector(_sync(worlds), lambda number: make_env(worlds, number), actor, steps)
+    collector = build_collector(_sync(num_envs), lambda number: make_env(num_envs, number), actor, steps)
     try:
         return next(iter(collector)).clone()
     finally:
@@ -222,7 +222,7 @@ def _workers(
 ) -> dict[str, float]:
     """Memory of so many workers, what it costs to speak to them, and whole iterations where each has a core."""
     steps = int(known["steps_per_iteration"])
-    pool = build_collector(settings, partial(make_env, settings.worlds), ppo.actor, steps)
+    pool = build_collector(settings, partial(make_env, settings.num_envs), ppo.actor, steps)
     try:
         batches = iter(pool)
         next(batches)
@@ -252,7 +252,7 @@ def _whole_iterations(
 ) -> dict[str, float]:
 
     steps = int(known["steps_per_iteration"])
-    collector = build_collector(settings, partial(make_env, settings.worlds), ppo.actor, steps)
+    collector = build_collector(settings, partial(make_env, settings.num_envs), ppo.actor, steps)
     try:
         batches = iter(collector)
         next(batches)

@@ -109,7 +109,7 @@ def run(overrides: Sequence[str], rounds: int) -> dict[str, Any]:
         "source": Path(source).name,
         "policy": "untrained" if values["checkpoint"] is None else str(values["checkpoint"]),
         "forecasts_by": str(values["forecast"]["checkpoint"]),
-        "vision": str(trained.made_with["vision"]["encoder"]["kind"]),
+        "vision": str(trained.source_config["vision"]["encoder"]["kind"]),
         "substeps": trained.humanoid.substeps,
         "processors": len(os.sched_getaffinity(0)),
     }
@@ -121,7 +121,7 @@ def _measured(
     """The last status of one stream."""
     source = source_settings(values, trained.config)
     loop = build_loop(values, trained, source, forecaster)
-    told = 0.0
+    reported = 0.0
     with contextlib.ExitStack() as stack:
         forecast = None if forecaster is None else forecaster.settings
         sinks = open_outputs(values, trained.humanoid, source, forecast, stack)
@@ -129,13 +129,13 @@ def _measured(
             _listen(f"ws://{values['server']['host']}:{sinks.port}", values["server"]["token"])
 
         def on_status(status: dict[str, Any]) -> None:
-            nonlocal told
+            nonlocal reported
             sinks.on_status(status)
-            if progress and status["seconds"] - told >= _TELL_EVERY:
-                told = status["seconds"]
+            if progress and status["seconds"] - reported >= _TELL_EVERY:
+                reported = status["seconds"]
                 counts = f"{status['used']} frames, {status['dropped']} dropped, {status['forecasts']} forecasts"
                 memory = float("nan") if status["rss_mb"] is None else status["rss_mb"]
-                print(f"{told:.0f} s, {counts}, {memory:.1f} MB", file=sys.stderr, flush=True)
+                print(f"{reported:.0f} s, {counts}, {memory:.1f} MB", file=sys.stderr, flush=True)
 
         settle_memory()
         return loop.run(sinks.on_pose, on_status, None, sinks.on_forecast)
@@ -185,11 +185,11 @@ def untrained_on(config: Mapping[str, Any], humanoid: HumanoidModel, states: Ten
     encoder = build_encoder(config["vision"]["encoder"])
     settings = from_mapping(RegressorSettings, config["regressor"], "conf/regressor")
     regressor = build_regressor(encoder, states, [Span(0, len(states))], settings, encoder.features).eval()
-    made_with = {"vision": config["vision"], "regressor": config["regressor"]}
-    material = still_frames(humanoid, regressor, made_with)
-    env = build_env(config, material, "test", worlds=1, whole_fragments=True, falls_end=False)
-    actor, critic = build_networks(config, material, env)
-    return Trained(humanoid, regressor, made_with, env, actor.eval(), critic.eval(), config)
+    source_config = {"vision": config["vision"], "regressor": config["regressor"]}
+    dataset = still_frames(humanoid, regressor, source_config)
+    env = build_env(config, dataset, "test", num_envs=1, whole_fragments=True, falls_end=False)
+    actor, critic = build_networks(config, dataset, env)
+    return Trained(humanoid, regressor, source_config, env, actor.eval(), critic.eval(), config)
 
 
 def untrained_forecaster(values: Mapping[str, Any], trained: Trained) -> Forecaster:
@@ -206,10 +206,10 @@ def untrained_forecaster(values: Mapping[str, Any], trained: Trained) -> Forecas
     config = compose_config("train", ["experiment=forecasting"])
     config = {**config, **{group: trained.config[group] for group in ("sim", "humanoid")}}
     frames = config["task"]["context"] + config["task"]["minimum"]
-    material = still_frames(trained.humanoid, trained.regressor, trained.made_with, frames)
+    dataset = still_frames(trained.humanoid, trained.regressor, trained.source_config, frames)
     worlds = 1 + settings.drawn
-    env = build_env(config, material, "test", worlds=worlds, whole_fragments=True, falls_end=False)
-    actor, _ = build_networks(config, material, env)
-    size = int(trained.made_with["vision"]["flow"]["stored_size"])
-    seen = (planes_of(trained.made_with["regressor"]), size, size)
+    env = build_env(config, dataset, "test", num_envs=worlds, whole_fragments=True, falls_end=False)
+    actor, _ = build_networks(config, dataset, env)
+    size = int(trained.source_config["vision"]["flow"]["stored_size"])
+    seen = (planes_of(trained.source_config["regressor"]), size, size)
     return Forecaster(env, actor.eval(), trained.regressor, seen, settings)

@@ -13,7 +13,7 @@ import torch
 from egopose.collection.collectors import CollectorSettings, base_env, build_collector, set_threads
 from egopose.core.config import compose_config
 from egopose.core.runtime import settle_heap
-from egopose.pipeline.dataset import motion_material
+from egopose.pipeline.dataset import motion_dataset
 from egopose.pipeline.environment import build_env
 from egopose.pipeline.networks import build_networks
 from egopose.training.ppo import PPO, PPOSettings
@@ -37,12 +37,12 @@ def run(overrides: Sequence[str], rounds: int) -> dict[str, Any]:
         InputError: a setting is unknown or out of range.
     """
     config = compose_config("train", ["sim=paper", *overrides])
-    material = motion_material(config)
+    dataset = motion_dataset(config)
     settings = CollectorSettings.from_config(config["collector"])
     torch.manual_seed(0)
     set_threads(settings.threads)
-    env = build_env(config, material, worlds=settings.worlds, threads=settings.physics_threads)
-    actor, critic = build_networks(config, material, env)
+    env = build_env(config, dataset, num_envs=settings.num_envs, threads=settings.physics_threads)
+    actor, critic = build_networks(config, dataset, env)
     ppo = PPO(actor, critic, PPOSettings.from_config(config["algo"]))
     collector = build_collector(settings, lambda _: env, actor, int(config["algo"]["steps_per_iteration"]))
     settle_heap()
@@ -76,7 +76,7 @@ def run(overrides: Sequence[str], rounds: int) -> dict[str, Any]:
         "rows": int(rows),
         "gradient_steps": ppo.settings.epochs * per_epoch,
         "control_steps_per_s": statistics.median(n / (c + a + u) for c, a, u, n in measured),
-        "worlds": settings.worlds,
+        "num_envs": settings.num_envs,
         "substeps": base_env(env).physics.substeps,
         "parts": parts,
     }

@@ -14,11 +14,11 @@ import torch
 from egopose.checkpoint.checkpoint import RunCheckpoint, read_json
 from egopose.checkpoint.pretrained import FOLDER
 from egopose.core.errors import InputError
-from egopose.vision.body_parts import LimbFinder
+from egopose.vision.body_parts import BodyPartEstimator
 
 
 @functools.cache
-def load_finder(name: str) -> LimbFinder:
+def load_body_part_estimator(name: str) -> BodyPartEstimator:
     """A finder that comes with the package, in evaluation mode.
 
     Args:
@@ -32,7 +32,7 @@ def load_finder(name: str) -> LimbFinder:
     if folder.parent != FOLDER or name in (".", "..") or not (folder / "manifest.json").is_file():
         raise InputError("regressor.kernel", "limbs", f"no limb finder {name!r} comes with egopose")
     config = read_json(folder, "config")
-    finder = LimbFinder(len(config["names"]), int(config["channels"]))
+    finder = BodyPartEstimator(len(config["names"]), int(config["channels"]))
     if "mirror" not in config:
         raise InputError(folder, "mirror", "is missing: the finder was made by an older egopose")
     for key, buffer in (("index", finder.mirror_index), ("sign", finder.mirror_sign)):

@@ -259,12 +259,12 @@ def find_checkpoint(path: str | Path, which: str = "latest") -> Path:
     candidates = _by_step(folder)
     if which == "best" and (best := rotation(folder, keep_last=1).best()) is not None:
         candidates = [best, *(c for c in candidates if c != best)]
-    found, damaged = _first_whole(candidates)
-    for error in damaged if found is not None else []:
-        print(f"warning: {error}; taking {found}", file=sys.stderr, flush=True)
-    if found is None:
+    result, damaged = _first_whole(candidates)
+    for error in damaged if result is not None else []:
+        print(f"warning: {error}; taking {result}", file=sys.stderr, flush=True)
+    if result is None:
         raise damaged[0] if damaged else InputError(folder / FOLDER, "checkpoint", "there is none yet")
-    return found
+    return result
 
 
 def recover(run_dir: str | Path) -> Path | None:
@@ -286,21 +286,21 @@ def recover(run_dir: str | Path) -> Path | None:
             os.replace(left, root / name)  # it was being replaced or dropped: still a checkpoint
         else:
             shutil.rmtree(left, ignore_errors=True)
-    found, damaged = _first_whole(_by_step(Path(run_dir)))
-    if found is None and damaged:
+    result, damaged = _first_whole(_by_step(Path(run_dir)))
+    if result is None and damaged:
         raise damaged[0]
     for error in damaged:
         aside = Path(error.source).with_name(SET_ASIDE + Path(error.source).name)
         shutil.rmtree(aside, ignore_errors=True)
         os.replace(error.source, aside)
-        print(f"warning: {error}; put aside as {aside.name}, going on from {found}", file=sys.stderr, flush=True)
-    return found
+        print(f"warning: {error}; put aside as {aside.name}, going on from {result}", file=sys.stderr, flush=True)
+    return result
 
 
 def _by_step(run_dir: Path) -> list[Path]:
     """All checkpoint folders, damaged ones as well, the newest first."""
-    found = [p for p in (run_dir / FOLDER).glob(f"{_PREFIX}*") if p.name.removeprefix(_PREFIX).isdigit()]
-    return sorted(found, key=lambda p: int(p.name.removeprefix(_PREFIX)), reverse=True)
+    result = [p for p in (run_dir / FOLDER).glob(f"{_PREFIX}*") if p.name.removeprefix(_PREFIX).isdigit()]
+    return sorted(result, key=lambda p: int(p.name.removeprefix(_PREFIX)), reverse=True)
 
 
 def _first_whole(candidates: list[Path]) -> tuple[Path | None, list[InputError]]:

@@ -36,13 +36,13 @@ def check_files(folder: Path) -> None:
     expected = safe_io.read_json(folder / CHECKSUMS, CHECKSUMS)
     if not isinstance(expected, dict):
         raise InputError(folder, CHECKSUMS, "cannot be read: is no object")
-    found = _checksums(folder)
-    for name in sorted(set(expected) | set(found)):
-        if name not in found:
+    result = _checksums(folder)
+    for name in sorted(set(expected) | set(result)):
+        if name not in result:
             raise InputError(folder, name, "is missing: the checkpoint is damaged")
         if name not in expected:
             raise InputError(folder, name, "does not belong to the checkpoint")
-        if expected[name] != found[name]:
+        if expected[name] != result[name]:
             raise InputError(folder, name, "does not match its checksum: the checkpoint is damaged")
 
 

@@ -137,10 +137,10 @@ def _saved_config(folder: Path, checkpoint: Path | None) -> dict[str, Any] | Non
     path = folder / "config.yaml"
     written: dict[str, Any] | None = None
     if path.is_file():
-        found = read_yaml(path, "config.yaml")
-        if not isinstance(found, dict):
+        result = read_yaml(path, "config.yaml")
+        if not isinstance(result, dict):
             raise InputError(path, "config.yaml", "cannot be read: is no mapping")
-        written = {str(key): value for key, value in found.items()}
+        written = {str(key): value for key, value in result.items()}
     if checkpoint is None:
         return written
     config = dict(read_json(checkpoint, "config"))
@@ -155,9 +155,9 @@ def differences(first: Any, second: Any, where: str = "") -> list[tuple[str, Any
     """Fields ``(dotted name, first's value, second's value)`` in which two nested mappings differ; absent is None."""
     if isinstance(first, Mapping) and isinstance(second, Mapping):
         return [
-            found
+            result
             for key in sorted(set(first) | set(second), key=str)
-            for found in differences(first.get(key), second.get(key), f"{where}.{key}" if where else str(key))
+            for result in differences(first.get(key), second.get(key), f"{where}.{key}" if where else str(key))
         ]
     return [] if first == second else [(where, first, second)]
 

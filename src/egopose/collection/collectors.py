@@ -12,13 +12,13 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.collectors import Collector
 from torchrl.envs import EnvBase
 
-from egopose.collection.env_groups import LaneCollector
+from egopose.collection.env_groups import GroupedCollector
 from egopose.collection.lazy_rewards import Completion, GaussianSampler, draws_gaussian
 from egopose.collection.stepping import TransformedEgoPoseEnv
 from egopose.collection.workers import Workers, base_env, read_simulation, write_simulation
 from egopose.core.config import from_mapping
 from egopose.core.errors import InputError
-from egopose.core.torch_settings import prefer_quick_products
+from egopose.core.torch_settings import enable_onednn_matmul
 
 __all__ = [
     "CollectorSettings",
@@ -41,26 +41,26 @@ class CollectorSettings:
     Args:
         kind: ``sync`` in this process; ``multi_sync`` and ``multi_async`` in processes, ``ray`` on machines of a Ray
             cluster: see :class:`egopose.collection.workers.Workers`.
-        worlds: of one environment.
+        num_envs: of one environment.
         physics_threads: of one environment.
         workers: processes, each with an environment of its own.
         threads: torch threads while collecting; physics has threads of its own.
         update_threads: torch threads while the networks are updated.
-        lanes: parts of the worlds of ``sync`` that take turns, see :class:`egopose.collection.env_groups.LaneCollector`; 1 to
-            step all at once, None for two from ``lanes_from`` steps of physics a control step on: below, taking turns
-            costs more than it hides.
-        lanes_from: see ``lanes``.
+        env_groups: parts of the worlds of ``sync`` that take turns, see
+            :class:`egopose.collection.env_groups.GroupedCollector`; 1 to step all at once, None for two from
+            ``env_groups_from`` steps of physics a control step on: below, taking turns costs more than it hides.
+        env_groups_from: see ``env_groups``.
         address: of the Ray cluster, see :class:`egopose.collection.workers.Workers`.
     """
 
     kind: str
-    worlds: int
+    num_envs: int
     physics_threads: int
     workers: int
     threads: int
     update_threads: int
-    lanes: int | None = 1
-    lanes_from: int = 8
+    env_groups: int | None = 1
+    env_groups_from: int = 8
     address: str | None = None
 
     @classmethod
@@ -69,11 +69,21 @@ class CollectorSettings:
         settings = from_mapping(cls, values, source)
         if settings.kind not in KINDS:
             raise InputError(source, "kind", f"must be one of {', '.join(KINDS)}, not {settings.kind!r}")
-        for name in ("worlds", "physics_threads", "workers", "threads", "update_threads", "lanes", "lanes_from"):
+        for name in (
+            "num_envs",
+            "physics_threads",
+            "workers",
+            "threads",
+            "update_threads",
+            "env_groups",
+            "env_groups_from",
+        ):
             if (value := getattr(settings, name)) is not None and value < 1:
                 raise InputError(source, name, f"must be at least 1, not {value}")
-        if settings.lanes is not None and settings.lanes > settings.worlds:
-            raise InputError(source, "lanes", f"must be at most the worlds, {settings.worlds}, not {settings.lanes}")
+        if settings.env_groups is not None and settings.env_groups > settings.num_envs:
+            raise InputError(
+                source, "env_groups", f"must be at most the worlds, {settings.num_envs}, not {settings.env_groups}"
+            )
         return settings
 
 
@@ -89,18 +99,18 @@ def build_collector(
 
     ``track_traj_ids=False`` and ``device=None`` because they are the quickest (measured; see docs/howto-bench.md).
     """
-    prefer_quick_products()
+    enable_onednn_matmul()
     if settings.kind == "sync":
         env = make_env(0)
         acting = GaussianSampler(policy) if draws_gaussian(policy) else policy
         collector: Callable[..., Collector] = Collector
         if isinstance(env, TransformedEgoPoseEnv):
-            env.defer_rewards()
+            env.make_rewards_lazy()
             if isinstance(acting, GaussianSampler) and acting.draws_from_entries():
-                lanes = settings.lanes or min(
-                    settings.worlds, 1 + (env.base_env.physics.substeps >= settings.lanes_from)
+                env_groups = settings.env_groups or min(
+                    settings.num_envs, 1 + (env.base_env.physics.substeps >= settings.env_groups_from)
                 )
-                collector = partial(LaneCollector, lanes=lanes)
+                collector = partial(GroupedCollector, env_groups=env_groups)
         return collector(
             env,
             acting,
@@ -115,7 +125,7 @@ def build_collector(
         make_env,
         policy,
         workers=settings.workers,
-        worlds=settings.worlds,
+        num_envs=settings.num_envs,
         steps_per_iteration=steps_per_iteration,
         threads=settings.threads,
         cpus=settings.physics_threads,

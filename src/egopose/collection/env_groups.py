@@ -17,11 +17,13 @@ from egopose.collection.lazy_rewards import GaussianSampler
 from egopose.collection.stepping import Entries, TransformedEgoPoseEnv
 
 _STEPS_PUT_AT_ONCE = 16
-_TURN = 5e-5  # s; measured, with two lanes on two cores: 4 % more steps/s than at Python's 5e-3, as much as at 1e-5
+_TURN = (
+    5e-5  # s; measured, with two env_groups on two cores: 4 % more steps/s than at Python's 5e-3, as much as at 1e-5
+)
 
 
-class LaneCollector(Collector):
-    """TorchRL's collector for small worlds: stepped in ``lanes`` that take turns, and put in a TensorDict at the end.
+class GroupedCollector(Collector):
+    """TorchRL's collector for small worlds, stepped in ``env_groups`` that take turns.
 
     With all worlds in step the physics' threads wait while the policy acts and the policy waits while they step. Here a
     lane's physics runs while another lane's observations, actions and resets are worked out, in a fixed order: what
@@ -30,15 +32,17 @@ class LaneCollector(Collector):
     Args:
         env: whose worlds are parted.
         policy: without a memory, see :meth:`GaussianSampler.draws_from_entries`.
-        lanes: how many.
+        env_groups: how many.
         **settings: of TorchRL's collector.
     """
 
-    def __init__(self, env: TransformedEgoPoseEnv, policy: GaussianSampler, *, lanes: int, **settings: Any) -> None:
+    def __init__(
+        self, env: TransformedEgoPoseEnv, policy: GaussianSampler, *, env_groups: int, **settings: Any
+    ) -> None:
         super().__init__(env, policy, use_buffers=False, return_same_td=True, **settings)
         if settings.get("exploration_type", ExplorationType.RANDOM) != ExplorationType.RANDOM:
             raise ValueError("actions are drawn at random here")
-        bounds = [env.batch_size[0] * number // lanes for number in range(lanes + 1)]
+        bounds = [env.batch_size[0] * number // env_groups for number in range(env_groups + 1)]
         self._lanes = [slice(*ends) for ends in pairwise(bounds)]
 
     def rollout(self) -> TensorDictBase:
@@ -96,9 +100,9 @@ class _Columns:
         self._waiting.clear()
 
 
-def _empty_batch(seen: Entries, after: Entries, worlds: int, steps: int) -> TensorDict:
+def _empty_batch(seen: Entries, after: Entries, num_envs: int, steps: int) -> TensorDict:
     """Room for ``[worlds, steps]`` of what is seen and done, and under ``next`` of what came of it."""
-    size = torch.Size([worlds, steps])
+    size = torch.Size([num_envs, steps])
     with torch.inference_mode(False):  # to be learned from
         first, then = (
             {key: torch.empty(*size, *entry.shape[1:], dtype=entry.dtype) for key, entry in entries.items()}

@@ -80,9 +80,9 @@ class TransformedEgoPoseEnv(TransformedEnv):
     def __init__(self, env: EgoPoseEnv, *transforms: Transform) -> None:
         super().__init__(env, Compose(*transforms))
 
-    def defer_rewards(self) -> None:
-        """See :meth:`EgoPoseEnv.defer_rewards`."""
-        self.base_env.defer_rewards()
+    def make_rewards_lazy(self) -> None:
+        """See :meth:`EgoPoseEnv.make_rewards_lazy`."""
+        self.base_env.make_rewards_lazy()
         self.empty_cache()
 
     def step_and_maybe_reset(self, tensordict: TensorDictBase) -> tuple[TensorDictBase, TensorDictBase]:

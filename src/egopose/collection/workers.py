@@ -24,7 +24,7 @@ from egopose.collection.moments import merge_states, without_counts
 from egopose.collection.stepping import key_path
 from egopose.core.errors import InputError
 from egopose.core.runtime import end_with_parent
-from egopose.core.torch_settings import prefer_quick_products
+from egopose.core.torch_settings import enable_onednn_matmul
 
 State = dict[str, Any]
 
@@ -112,7 +112,7 @@ class Workers:
         make_env: makes the environment of the worker of that number, in its process.
         policy: whose parameters :meth:`update_policy_weights_` sends.
         workers: how many.
-        worlds: of each environment.
+        num_envs: of each environment.
         steps_per_iteration: control steps an iteration, over all workers; rounded up to whole steps of all worlds.
         threads: of torch in a worker.
         cpus: that Ray keeps for a worker.
@@ -129,7 +129,7 @@ class Workers:
         policy: TensorDictModuleBase,
         *,
         workers: int,
-        worlds: int,
+        num_envs: int,
         steps_per_iteration: int,
         threads: int,
         cpus: int,
@@ -137,7 +137,7 @@ class Workers:
     ) -> None:
         self.kind, self.policy, self.count = kind, policy, workers
         self._end_ray: Callable[[], None] | None = None
-        frames = -(-steps_per_iteration // (workers * worlds)) * worlds
+        frames = -(-steps_per_iteration // (workers * num_envs)) * num_envs
         # Each process would begin with the same random numbers otherwise, and all draw the same actions.
         makers = [partial(_seeded, make_env, torch.initial_seed(), number) for number in range(workers)]
         if kind == "ray":
@@ -273,7 +273,7 @@ class Workers:
 
 def _seeded(make_env: Callable[[int], EnvBase], seed: int, number: int) -> EnvBase:
     end_with_parent()  # of itself it would look only after its batch; Ray ends its workers by its own means
-    prefer_quick_products()
+    enable_onednn_matmul()
     torch.manual_seed((seed * 1000 + 1 + number) % 2**63)
     return make_env(number)
 

@@ -9,7 +9,7 @@ from typing import Any
 
 
 @cache
-def prefer_quick_products() -> bool:
+def enable_onednn_matmul() -> bool:
     """Have torch multiply matrices by oneDNN where that keeps single precision; True where it does from here on.
 
     MKL, torch's own choice, leaves the 512-bit units of AMD's processors idle: oneDNN takes less than half the time
@@ -35,7 +35,7 @@ def torch_threads(count: int) -> Iterator[None]:
     """
     import torch
 
-    prefer_quick_products()
+    enable_onednn_matmul()
     before = torch.get_num_threads()
     torch.set_num_threads(count)
     try:

@@ -133,8 +133,8 @@ def _find_offset(config: Mapping[str, Any], source: TakeSource, motion: Motion) 
 
     assert source.video is not None
     flow = FlowConfig(**config["vision"]["flow"])
-    found = sync_offset(source.video, motion, settings_of(config["data"]), flow, source.camera, source.mapping)
-    return found.offset
+    result = sync_offset(source.video, motion, settings_of(config["data"]), flow, source.camera, source.mapping)
+    return result.offset
 
 
 def _row(

@@ -14,7 +14,7 @@ from egopose.humanoid.foot_geometry import sole_edges, sole_names, sole_position
 from egopose.humanoid.model import HumanoidModel
 from egopose.motion import rotations as rot
 from egopose.motion.foot_contact_ik import plant_feet
-from egopose.motion.ground_alignment import SettleSettings, settle
+from egopose.motion.ground_alignment import GroundAlignmentSettings, settle
 from egopose.motion.motion import Motion
 from egopose.motion.retarget import RetargetReport, retarget
 
@@ -25,16 +25,16 @@ class PreparationSettings:
 
     Args:
         cutoff_hz: of the zero-lag low-pass over the retargeted motion; None for none.
-        settle: see :class:`egopose.motion.ground_alignment.SettleSettings`.
+        settle: see :class:`egopose.motion.ground_alignment.GroundAlignmentSettings`.
     """
 
     cutoff_hz: float | None = 8.0
-    settle: SettleSettings = field(default_factory=SettleSettings)
+    settle: GroundAlignmentSettings = field(default_factory=GroundAlignmentSettings)
 
     @classmethod
     def from_mapping(cls, values: Mapping[str, Any]) -> PreparationSettings:
         """From a resolved config group ``{cutoff_hz, settle: {...}}``."""
-        return cls(values.get("cutoff_hz", 8.0), SettleSettings(**dict(values.get("settle", {}))))
+        return cls(values.get("cutoff_hz", 8.0), GroundAlignmentSettings(**dict(values.get("settle", {}))))
 
 
 def without_lead_in(motion: Motion) -> Motion:

@@ -24,7 +24,7 @@ from egopose.motion.io import read_motion
 from egopose.motion.mapping import identify
 from egopose.motion.motion import Motion
 from egopose.motion.rotations import Array
-from egopose.vision.camera_rotation import camera_turning
+from egopose.vision.camera_rotation import camera_rotation
 from egopose.vision.flow import FlowConfig, flow_of_frames
 from egopose.vision.lens import Camera, undo_rolling_shutter
 from egopose.vision.video import Frame, probe_video, read_frames
@@ -121,7 +121,7 @@ def video_turning(
             interval = times[number] - times[number - 1]
             if camera.readout:
                 moved = undo_rolling_shutter(moved, camera.readout, interval)
-            turns.append(camera_turning(moved[None], view)[0] / interval)
+            turns.append(camera_rotation(moved[None], view)[0] / interval)
     if len(turns) < 2:
         raise InputError(path, "video", "has fewer than 3 frames")
     # The middle row is exposed half a readout after the frame's stamp.
@@ -178,18 +178,18 @@ def find_offset(head: Array, camera: Array, settings: SyncSettings, source: str 
         between = 0.5 * (before - after) / bend if bend > 0 else 0.0
     others = left[np.abs(lags - lags[best]) > settings.apart * settings.rate]
     confidence = float(others.min() / max(left[best], 1e-12)) if len(others) else 1.0
-    found = Sync((float(lags[best]) + between) / settings.rate, float(np.sqrt(max(1.0 - left[best], 0.0))), confidence)
+    result = Sync((float(lags[best]) + between) / settings.rate, float(np.sqrt(max(1.0 - left[best], 0.0))), confidence)
     if confidence < settings.confidence:
         raise InputError(
             source,
             "sync_offset",
-            f"no offset stands out: {found.offset:.3f} s explains hardly more than another (confidence "
+            f"no offset stands out: {result.offset:.3f} s explains hardly more than another (confidence "
             f"{confidence:.2f}, {settings.confidence:g} is needed). Check that video and motion are of one take and at "
             f"their true speed (they last {len(camera) / settings.rate:.1f} and {seconds:.1f} s; a BVH's Frame Time, "
             "camera.fps), give a longer motion with quick turns of the head, or measure the offset at a clap and give "
             "it as a number",
         )
-    return found
+    return result
 
 
 def _at(head: Array, camera: Array, lag: int) -> float:

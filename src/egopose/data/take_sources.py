@@ -56,25 +56,25 @@ def find_sources(settings: Mapping[str, Any]) -> list[TakeSource]:
     """
     kind = settings.get("source")
     if kind == "embedded":
-        found = _in_folder(Path(str(files("egopose") / "assets" / "clips")), settings)
+        result = _in_folder(Path(str(files("egopose") / "assets" / "clips")), settings)
     elif kind == "folder":
         if not settings.get("folder"):
             raise InputError(
                 "data", "folder", f"say where the set lies: data.folder=PATH ({settings.get('about', '')})"
             )
-        found = _in_folder(Path(str(settings["folder"])).expanduser(), settings)
+        result = _in_folder(Path(str(settings["folder"])).expanduser(), settings)
     elif kind == "takes":
-        found = _listed(
+        result = _listed(
             settings.get("takes"),
             _options(settings.get("reader"), "data.reader"),
             _options(settings.get("camera"), "data.camera"),
         )
     else:
         raise InputError("data", "source", f"must be embedded, folder or takes, not {kind!r}")
-    names = [s.name for s in found]
+    names = [s.name for s in result]
     if twice := sorted({n for n in names if names.count(n) > 1}):
         raise InputError("data", "takes", f"names stand twice: {', '.join(twice)}")
-    return found
+    return result
 
 
 def _in_folder(folder: Path, settings: Mapping[str, Any]) -> list[TakeSource]:

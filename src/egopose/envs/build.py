@@ -14,7 +14,7 @@ from egopose.envs.aids import Aids
 from egopose.envs.env import EgoPoseEnv
 from egopose.envs.mdp.rewards import build_reward
 from egopose.envs.problem import ActionSettings, ImitationProblem, TakeTable, TerminationSettings
-from egopose.envs.reference_forecasts import Futures
+from egopose.envs.reference_forecasts import ReferenceForecasts
 from egopose.envs.starts import AdaptiveStarts, Starts, UniformStarts, WholeFragments, after_context
 from egopose.humanoid.model import HumanoidModel
 
@@ -27,7 +27,7 @@ def build_problem(
     reward: Mapping[str, Any],
     *,
     action_reference: Tensor | None = None,
-    futures: Futures | None = None,
+    forecasts: ReferenceForecasts | None = None,
 ) -> ImitationProblem:
     """The imitation problem of a ``conf/task`` and a ``conf/reward`` file.
 
@@ -42,14 +42,14 @@ def build_problem(
         ActionSettings(**task["action"]),
         TerminationSettings(**task["termination"]),
         action_reference,
-        futures,
+        forecasts,
     )
 
 
 def build_env(
     problem: ImitationProblem,
     fragments: Sequence[FragmentLike],
-    n_worlds: int,
+    num_envs: int,
     task: Mapping[str, Any],
     *,
     threads: int = 1,
@@ -64,7 +64,7 @@ def build_env(
     Args:
         problem: see :func:`build_problem`.
         fragments: where episodes lie.
-        n_worlds: N; with ``whole_fragments`` usually their number.
+        num_envs: N; with ``whole_fragments`` usually their number.
         task: ``conf/task``; with a ``context`` an episode begins at the last frame of that many.
         threads: of the physics.
         seed: of the starts.
@@ -84,5 +84,5 @@ def build_env(
     else:
         starts = UniformStarts(fragments, offsets, lengths, task["horizon"], task["minimum"])
     return EgoPoseEnv(
-        problem, n_worlds, starts, threads=threads, seed=seed, dump_dir=dump_dir, aids=aids, workers=workers
+        problem, num_envs, starts, threads=threads, seed=seed, dump_dir=dump_dir, aids=aids, workers=workers
     )

@@ -69,7 +69,7 @@ class EgoPoseEnv(EnvBase):
 
     Args:
         problem: humanoid, reference, reward, action and termination.
-        n_worlds: N.
+        num_envs: N.
         starts: deals episodes.
         threads: of the physics.
         seed: of the starts.
@@ -77,7 +77,7 @@ class EgoPoseEnv(EnvBase):
         aids: of training, see :mod:`egopose.envs.aids`; None for none.
         workers: environments like this one that a run collects in: the aids' time goes by in all of them.
 
-    A collector need not know a reward to act on: after :meth:`defer_rewards` it asks for those of a batch at once.
+    A collector need not know a reward to act on: after :meth:`make_rewards_lazy` it asks for those of a batch at once.
 
     The simulation's state is :meth:`state_dict`; note that TorchRL's ``TransformedEnv.state_dict`` holds the
     transforms only: take the base environment's beside it.
@@ -86,7 +86,7 @@ class EgoPoseEnv(EnvBase):
     def __init__(
         self,
         problem: ImitationProblem,
-        n_worlds: int,
+        num_envs: int,
         starts: Starts,
         *,
         threads: int = 1,
@@ -95,12 +95,12 @@ class EgoPoseEnv(EnvBase):
         aids: Aids | None = None,
         workers: int = 1,
     ) -> None:
-        super().__init__(device=None, batch_size=torch.Size([n_worlds]))
+        super().__init__(device=None, batch_size=torch.Size([num_envs]))
         humanoid = problem.humanoid
         self.problem, self.starts = problem, starts
         self.physics = BatchedPhysics(
             humanoid.mj_model,
-            n_worlds,
+            num_envs,
             humanoid.substeps,
             threads,
             body_ids=humanoid.body_ids,
@@ -113,12 +113,12 @@ class EgoPoseEnv(EnvBase):
         self._generator = torch.Generator().manual_seed(seed)
         # Arrays, as everything that is worked out for the few worlds of a step but what is put in entries: an operator
         # of torch costs several times as much.
-        self._take, self._start, self._stop, self._frame = np.zeros((4, n_worlds), dtype=np.int64)
-        self.placed = torch.zeros(n_worlds, humanoid.mj_model.nu, dtype=torch.float64)
+        self._take, self._start, self._stop, self._frame = np.zeros((4, num_envs), dtype=np.int64)
+        self.placed = torch.zeros(num_envs, humanoid.mj_model.nu, dtype=torch.float64)
         self._unrewarded: list[_Unrewarded] | None = None
         self._earnings: list[Tensor] = []
         self._no_flags = _no_flags(self.batch_size)
-        self._unknown_reward = torch.full((n_worlds, 1), torch.nan)
+        self._unknown_reward = torch.full((num_envs, 1), torch.nan)
         self._make_specs()
 
     def _make_specs(self) -> None:
@@ -149,7 +149,7 @@ class EgoPoseEnv(EnvBase):
         n = self.batch_size[0]
         return {"reward_terms": Composite({k: Unbounded((n, 1)) for k in self.problem.reward.names}, shape=(n,))}
 
-    def defer_rewards(self) -> None:
+    def make_rewards_lazy(self) -> None:
         """From now on a step's ``reward`` is NaN and it has no ``reward_terms``: :meth:`rewards_due` gives both.
 
         What the reward reads of each step is kept until then.

@@ -12,7 +12,7 @@ from torch import Tensor
 from egopose.envs.mdp import terminations
 from egopose.envs.mdp.observations import BodyLayout, BodyState, BodyView, humanoid_state_rows
 from egopose.envs.mdp.rewards import Reward
-from egopose.envs.reference_forecasts import Futures
+from egopose.envs.reference_forecasts import ReferenceForecasts
 from egopose.humanoid.model import HumanoidModel
 from egopose.humanoid.torques import torque_driven
 
@@ -96,7 +96,7 @@ class ImitationProblem:
         reward: see :mod:`egopose.envs.mdp.rewards`.
         action, termination: settings.
         action_reference: ``[F, nu]`` rad, the base target for reaching each frame; needed by ``regressor``.
-        futures: kinematic forecasts: episodes begin in their first states in place of the reference's.
+        forecasts: kinematic forecasts: episodes begin in their first states in place of the reference's.
 
     Raises:
         ValueError: the reference does not fit the humanoid, or the action's table is missing or of another shape.
@@ -111,7 +111,7 @@ class ImitationProblem:
         action: ActionSettings,
         termination: TerminationSettings,
         action_reference: Tensor | None = None,
-        futures: Futures | None = None,
+        forecasts: ReferenceForecasts | None = None,
     ) -> None:
         if action.kind == "torque":
             humanoid = torque_driven(humanoid, action.joint_damping)
@@ -126,7 +126,7 @@ class ImitationProblem:
                 f"reference has {reference['xpos'].shape[1]} bodies, the humanoid {len(humanoid.body_ids)}"
             )
         self.humanoid, self.takes, self.reward = humanoid, takes, reward
-        self.action, self.termination, self.futures = action, termination, futures
+        self.action, self.termination, self.forecasts = action, termination, forecasts
         self.n_frames = reference.shape[0]
         self.reference = reference
         self.layout = BodyLayout(
@@ -174,8 +174,8 @@ class ImitationProblem:
 
         The reference's, or where it stands and faces the state a forecast begins in.
         """
-        if self.futures is not None:
-            return self.futures.first_state(frame, self._qpos.index_select(0, frame), self._range.T.numpy())
+        if self.forecasts is not None:
+            return self.forecasts.first_state(frame, self._qpos.index_select(0, frame), self._range.T.numpy())
         return self._qpos.index_select(0, frame), self._qvel.index_select(0, frame)
 
     def view(self, state: BodyState | BodyView) -> BodyView:

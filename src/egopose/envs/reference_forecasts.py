@@ -16,7 +16,7 @@ from egopose.motion import rotations as rot
 from egopose.motion.rotations import Array
 
 
-class Futures:
+class ReferenceForecasts:
     """Humanoid states at every step of every curve; a step behind a curve's end is its last.
 
     Args:
@@ -84,7 +84,7 @@ class Futures:
         return (weights.gather(1, near).unsqueeze(-1) * curves).sum(dim=1)
 
 
-class FollowFuture(Transform):
+class TrackForecast(Transform):
     """What a policy needs to follow a curve. To stand before :class:`egopose.envs.transforms.StateNormalizer`.
 
     Writes ``followed_targets [nu]``, rad from the rest pose: the joint angles the curve has at the next step, and its
@@ -93,7 +93,7 @@ class FollowFuture(Transform):
     step to the next frame; ``visual_context``, the scaled poses of the steps ``ahead``.
 
     Args:
-        futures: the curves.
+        forecasts: the curves.
         scale: ``[S]``, what a unit of each number is divided by (a deviation).
         rest: ``[nu]`` rad.
         lag: ``[nu]`` s.
@@ -104,13 +104,13 @@ class FollowFuture(Transform):
     scale: Tensor
 
     def __init__(
-        self, futures: Futures, scale: Tensor, rest: Tensor, lag: Tensor, clip: float, ahead: Sequence[int]
+        self, forecasts: ReferenceForecasts, scale: Tensor, rest: Tensor, lag: Tensor, clip: float, ahead: Sequence[int]
     ) -> None:
         super().__init__(
             in_keys=["humanoid_state", "episode_start", "episode_step"],
             out_keys=["followed_targets", "tracking_error", "visual_context"],
         )
-        self.futures, self.rest, self.lag, self.clip, self.ahead = futures, rest, lag, clip, tuple(ahead)
+        self.forecasts, self.rest, self.lag, self.clip, self.ahead = forecasts, rest, lag, clip, tuple(ahead)
         # A buffer: a policy must see other data in the units it was trained in.
         self.register_buffer("scale", scale)
 
@@ -129,11 +129,11 @@ class FollowFuture(Transform):
             The curve's states z ``[N, S]`` there and at the next step, ``followed_targets [N, nu]`` and
             ``visual_context [N, P * steps ahead]``.
         """
-        now, following = self.futures.states(start, step), self.futures.states(start, step + 1)
-        size = self.futures.coefficients.shape[-1]
+        now, following = self.forecasts.states(start, step), self.forecasts.states(start, step + 1)
+        size = self.forecasts.coefficients.shape[-1]
         angles, rates = following[..., 5 : size - 6], following[..., size:]
         targets = (angles.double() + self.lag * rates - self.rest).float()
-        later = [self.futures.poses(start, step + ahead) / self.scale[:size] for ahead in self.ahead]
+        later = [self.forecasts.poses(start, step + ahead) / self.scale[:size] for ahead in self.ahead]
         return now, following, targets, torch.cat(later, dim=-1)
 
     def error(self, state: Tensor, now: Tensor, following: Tensor) -> Tensor:
@@ -149,7 +149,7 @@ class FollowFuture(Transform):
 
     def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
         assert isinstance(observation_spec, Composite)
-        size = self.futures.coefficients.shape[-1]
+        size = self.forecasts.coefficients.shape[-1]
         widths = (len(self.rest), 2 * len(self.scale), size * len(self.ahead))
         for key, width in zip(self.out_keys, widths, strict=True):
             shape = (*observation_spec.shape, width)

@@ -15,11 +15,11 @@ from egopose.data.fragments import FragmentLike
 from egopose.envs.test_time import Controller
 from egopose.evaluation.protocols import ContactSettings, TakeScores, score_take
 from egopose.evaluation.resets import TakeTriggers, as_dict, take_triggers
-from egopose.inference.counterfactuals import Forks
+from egopose.inference.counterfactuals import CounterfactualRollouts
 from egopose.inference.estimator import Estimate, estimate_takes
 from egopose.inference.failsafe import FailSafe, FailSafeSettings
 from egopose.inference.planner import Planner
-from egopose.inference.planner_settings import PlannerSettings, planned_kappa
+from egopose.inference.planner_settings import PlannerSettings, planned_threshold
 from egopose.models.pose_regression import pose_regression
 from egopose.motion import rotations as rot
 from egopose.motion.motion import Motion
@@ -64,7 +64,7 @@ def evaluate_agent(
 
     Args:
         agent: see :func:`egopose.pipeline.agent.load_agent`.
-        fragments: those of ``split``, in the material's order.
+        fragments: those of ``split``, in the dataset's order.
         names: one a fragment.
         split: ``test`` or ``train``.
         failsafe: when the humanoid restarts.
@@ -76,8 +76,8 @@ def evaluate_agent(
     Raises:
         InputError: there are no regressed states, or a fragment is shorter than 4 frames.
     """
-    material = agent.material
-    if material.states is None:
+    dataset = agent.dataset
+    if dataset.states is None:
         raise InputError(agent.path, "regressor", "the policy starts from the state regressor, and there is none")
     for fragment, name in zip(fragments, names, strict=True):
         if fragment.stop - fragment.start < SHORTEST:
@@ -91,34 +91,34 @@ def evaluate_agent(
 
 def estimate_and_judge(
     agent: Agent,
-    worlds: int,
+    num_envs: int,
     split: str,
     failsafe: FailSafeSettings,
     threads: int,
     window: int | None,
     planner: PlannerSettings | None = None,
 ) -> tuple[list[Estimate], Sequence[TakeTriggers | None]]:
-    """Estimates of the first ``worlds`` fragments of ``split``, and the fail-safe's triggers, judged.
+    """Estimates of the first ``num_envs`` fragments of ``split``, and the fail-safe's triggers, judged.
 
     Other arguments as of :func:`evaluate_agent`.
     """
-    material = agent.material
-    fragments = list(material.train if split == "train" else material.test)[:worlds]
-    by_length = sorted(range(worlds), key=lambda i: fragments[i].stop - fragments[i].start)
+    dataset = agent.dataset
+    fragments = list(dataset.train if split == "train" else dataset.test)[:num_envs]
+    by_length = sorted(range(num_envs), key=lambda i: fragments[i].stop - fragments[i].start)
     # All worlds are stepped until the longest fragment ends, and with a planner each has dozens of copies: those of
     # like length go together.
-    groups = [list(range(worlds))]
+    groups = [list(range(num_envs))]
     if planner is not None:
-        groups = [by_length[at : at + _PLANNED_TOGETHER] for at in range(0, worlds, _PLANNED_TOGETHER)]
+        groups = [by_length[at : at + _PLANNED_TOGETHER] for at in range(0, num_envs, _PLANNED_TOGETHER)]
     estimates: dict[int, Estimate] = {}
     triggers: dict[int, TakeTriggers | None] = {}
     for group in groups:
         chosen = [fragments[i] for i in group]
         with torch_threads(1):
-            found, judged = _together(agent, chosen, split, failsafe, threads, window, planner)
-        estimates |= dict(zip(group, found, strict=True))
+            result, judged = _together(agent, chosen, split, failsafe, threads, window, planner)
+        estimates |= dict(zip(group, result, strict=True))
         triggers |= dict(zip(group, judged, strict=True))
-    return [estimates[i] for i in range(worlds)], [triggers[i] for i in range(worlds)]
+    return [estimates[i] for i in range(num_envs)], [triggers[i] for i in range(num_envs)]
 
 
 def _together(
@@ -135,24 +135,29 @@ def _together(
 
     def make_env(count: int) -> TransformedEnv:
         options = {"threads": threads, "whole_fragments": True, "falls_end": False}
-        return agent.make_env(split, worlds=count, fragments=fragments, **options)
+        return agent.make_env(split, num_envs=count, fragments=fragments, **options)
 
-    env, forks = make_env(worlds), Forks()
-    guard, states = FailSafe(worlds, failsafe.for_run(agent.config, planned_kappa(planner))), agent.followed_states()
+    env, counterfactuals = make_env(worlds), CounterfactualRollouts()
+    guard, states = (
+        FailSafe(worlds, failsafe.for_run(agent.config, planned_threshold(planner))),
+        agent.followed_states(),
+    )
     ahead = None
     if planner is not None:
         ahead = Planner(make_env(worlds * planner.samples), agent.actor, agent.critic, states, planner)
-    estimates = estimate_takes(env, agent.actor, agent.critic, states, guard, forks=forks, planner=ahead)
+    estimates = estimate_takes(
+        env, agent.actor, agent.critic, states, guard, counterfactuals=counterfactuals, planner=ahead
+    )
     env.close()
     if ahead is not None:
         ahead.close()
     if window is None:
         return estimates, [None] * worlds
     to_fall: list[dict[int, int | None]] = [{} for _ in estimates]
-    falls = forks.frames_to_fall(make_env, agent.actor, window)
-    for (world, frame), frames in zip(forks.places, falls, strict=True):
+    falls = counterfactuals.frames_to_fall(make_env, agent.actor, window)
+    for (world, frame), frames in zip(counterfactuals.places, falls, strict=True):
         to_fall[world][frame - estimates[world].start] = frames
-    return estimates, [take_triggers(e, found, window) for e, found in zip(estimates, to_fall, strict=True)]
+    return estimates, [take_triggers(e, result, window) for e, result in zip(estimates, to_fall, strict=True)]
 
 
 def _result(
@@ -163,12 +168,12 @@ def _result(
     contact: ContactSettings,
     triggers: TakeTriggers | None,
 ) -> FragmentResult:
-    humanoid, rows = agent.material.humanoid, slice(estimate.start, estimate.start + len(estimate.qpos))
+    humanoid, rows = agent.dataset.humanoid, slice(estimate.start, estimate.start + len(estimate.qpos))
     fps = 1.0 / humanoid.control_dt
-    truth: Array = torch.as_tensor(agent.material.reference["qpos"][rows]).double().numpy()
-    assert agent.material.states is not None
+    truth: Array = torch.as_tensor(agent.dataset.reference["qpos"][rows]).double().numpy()
+    assert agent.dataset.states is not None
     regressed = pose_regression(
-        agent.material.states[rows].numpy(),
+        agent.dataset.states[rows].numpy(),
         humanoid.skeleton,
         truth[0, :2],
         rot.heading(truth[0, 3:7]),
@@ -190,15 +195,16 @@ def _result(
 
 
 def failsafe_figures(results: Sequence[FragmentResult], settings: FailSafeSettings, window: int) -> dict[str, Any]:
-    """A run's fail-safe for JSON: mode, kappa and window, and :func:`egopose.evaluation.resets.as_dict` of it all."""
+    """A run's fail-safe for JSON: mode, reset_threshold and window, and :func:`egopose.evaluation.resets.as_dict` of it
+    all."""
     judged = [(one.motion.name, one.triggers) for one in results if one.triggers is not None]
-    names, takes = [name for name, _ in judged], [found for _, found in judged]
-    about = {"mode": settings.mode, "kappa": settings.kappa, "window_frames": window}
+    names, takes = [name for name, _ in judged], [result for _, result in judged]
+    about = {"mode": settings.mode, "reset_threshold": settings.reset_threshold, "window_frames": window}
     return about | as_dict(names, takes, results[0].motion.fps)
 
 
 def survival_figures(
-    agent: Agent, start_policy: Controller, split: str, worlds: int, seed: int, threads: int
+    agent: Agent, start_policy: Controller, split: str, num_envs: int, seed: int, threads: int
 ) -> dict[str, dict[str, float]]:
     """Frames until a fall of the policy and of what it must beat, all from the same starts on the reference.
 
@@ -210,14 +216,14 @@ def survival_figures(
         agent: see :func:`egopose.pipeline.agent.load_agent`.
         start_policy: an actor as training found it.
         split: ``test`` or ``train``.
-        worlds: episodes.
+        num_envs: episodes.
         seed: of the starts.
         threads: of the physics.
 
     Returns:
         ``{controller: {"frames": mean frames survived, "fell": share of episodes}}``.
     """
-    env = agent.make_env(split, worlds=worlds, threads=threads)
+    env = agent.make_env(split, num_envs=num_envs, threads=threads)
     controllers: dict[str, Controller] = {"policy": agent.actor, "start_policy": start_policy}
     if env.base_env.problem.action.kind == "pd":
         controllers |= {"base_tracking": base_tracking(env), "reference_tracking": reference_tracking(env)}

@@ -19,7 +19,7 @@ from egopose.evaluation.estimation_run import run_evaluation, summary
 from egopose.evaluation.forecast_run import run_forecast_evaluation
 from egopose.evaluation.take_videos import take_videos
 from egopose.pipeline.agent import load_agent
-from egopose.pipeline.dataset import absolute_paths, load_material
+from egopose.pipeline.dataset import absolute_paths, load_dataset
 from egopose.pipeline.networks import build_networks
 from egopose.pipeline.training import run_training
 
@@ -47,7 +47,7 @@ def run_demo(budget: str, overrides: list[str]) -> Path:
         "egopose demo: embedded clips -> rendered wearer's video -> state regressor -> policy -> evaluation", flush=True
     )
     # Data and regressor first: what time they leave is training's.
-    load_material(config)
+    load_dataset(config)
     left = config["demo"]["seconds"] - config["demo"]["evaluation_seconds"] - (time.monotonic() - began)
     config["training"]["max_seconds"] = config["training"]["max_seconds"] or max(_SHORTEST_TRAINING, left)
     run_training(config, folder)
@@ -59,19 +59,19 @@ def run_demo(budget: str, overrides: list[str]) -> Path:
     print(summary(results), flush=True)
 
     # Held-out pieces are a few seconds long; the training takes show how long the body really stays up.
-    env = agent.make_env("train", worlds=1)
-    start, _ = build_networks(agent.config, agent.material, env)
+    env = agent.make_env("train", num_envs=1)
+    start, _ = build_networks(agent.config, agent.dataset, env)
     env.close()
     survive = settings["survival"]
     figures = survival_figures(
-        agent, start, "train", int(survive["worlds"]), int(survive["seed"]), int(settings["threads"])
+        agent, start, "train", int(survive["num_envs"]), int(survive["seed"]), int(settings["threads"])
     )
     policy = figures["policy"]["frames"]
-    ratios = {name: policy / found["frames"] for name, found in figures.items() if name != "policy"}
+    ratios = {name: policy / result["frames"] for name, result in figures.items() if name != "policy"}
     print("\nframes survived from random starts on the training takes (at most 199):")
-    for name, found in figures.items():
+    for name, result in figures.items():
         beaten = "" if name == "policy" else f"   policy survives {ratios[name]:.2f} times as long"
-        print(f"  {name.replace('_', ' '):<20}{found['frames']:>7.1f}{beaten}")
+        print(f"  {name.replace('_', ' '):<20}{result['frames']:>7.1f}{beaten}")
 
     shipped = show_shipped(agent.config, folder / "evaluation")
     minutes = (time.monotonic() - began) / 60

@@ -130,9 +130,9 @@ def figures_table(results: Mapping[str, Any]) -> str:
         cells = [page.text(f"{metric.label} ({metric.unit})" if metric.unit else metric.label)]
         for part, names, decimals in (("figures", methods, metric.decimals), ("ratios", divided, 3)):
             for name in names:
-                found = results[part][name].get(metric.key)
-                between = (found["low"], found["high"]) if found and found["low"] is not None else None
-                cells.append(page.number(found["value"] if found else None, decimals, between))
+                result = results[part][name].get(metric.key)
+                between = (result["low"], result["high"]) if result and result["low"] is not None else None
+                cells.append(page.number(result["value"] if result else None, decimals, between))
         cells.append(page.number(results.get("reference", {}).get(metric.key), metric.decimals))
         rows.append(cells)
     resets = [page.number(results["resets"][m], 1) for m in methods]
@@ -158,24 +158,33 @@ def _about(results: Mapping[str, Any]) -> str:
 def _survival(results: Mapping[str, Any]) -> str:
     rows = [
         [page.text(run), page.text(name.replace("_", " ")), page.number(f["frames"], 1), page.number(f["fell"], 2)]
-        for run, found in enumerate(results.get("survival", []))
-        for name, f in found.items()
+        for run, result in enumerate(results.get("survival", []))
+        for name, f in result.items()
     ]
     return page.table(["run", "controller", "frames until a fall", "share that fell"], rows)
 
 
 def _failsafe(results: Mapping[str, Any]) -> str:
-    keys = ("triggers", "foreseen", "late", "false_alarm", "cut_short", "missed", "median_lead_frames", "kappa")
+    keys = (
+        "triggers",
+        "foreseen",
+        "late",
+        "false_alarm",
+        "cut_short",
+        "missed",
+        "median_lead_frames",
+        "reset_threshold",
+    )
     runs = results.get("failsafe", [])
     header = ["run", "mode", *(key.replace("_", " ") for key in keys), "fallen (% of frames)"]
     rows = [
         [
             page.text(run),
-            page.text(found["mode"]),
-            *(page.number(found[key], 3 if key == "kappa" else 0) for key in keys),
-            page.number(100 * found["fallen_share"], 1),
+            page.text(result["mode"]),
+            *(page.number(result[key], 3 if key == "reset_threshold" else 0) for key in keys),
+            page.number(100 * result["fallen_share"], 1),
         ]
-        for run, found in enumerate(runs)
+        for run, result in enumerate(runs)
     ]
     if not rows:
         return '<p class="note">Not judged: evaluate anew, older evaluations did not.</p>'
@@ -288,7 +297,7 @@ def _moments(takes: Sequence[TakeMotions], humanoid: HumanoidModel | None, setti
         captions.append(f"{takes[k].name}, {t / takes[k].reference.fps:.2f} s (frame {t}): {away:.0f} mm")
     figures = [page.picture(frame, caption) for frame, caption in zip(frames, captions, strict=True)]
     parts = (("Worst", figures[: len(worst)]), ("Best", figures[len(worst) :]))
-    return "".join(f'<h3>{name}</h3><div class="moments">{"".join(found)}</div>' for name, found in parts)
+    return "".join(f'<h3>{name}</h3><div class="moments">{"".join(result)}</div>' for name, result in parts)
 
 
 def _mean_over(curves: Sequence[Array], length: int) -> Array:

@@ -20,7 +20,7 @@ from egopose.evaluation.protocols import Comparison, ContactSettings, fragment_n
 from egopose.evaluation.report import HEADLINE
 from egopose.inference.failsafe import FailSafeSettings
 from egopose.inference.outputs import TakeVideo, write_footage, write_side_by_side
-from egopose.inference.planner_settings import planned_kappa, planner_settings
+from egopose.inference.planner_settings import planned_threshold, planner_settings
 from egopose.pipeline.agent import Agent
 from egopose.pipeline.networks import build_networks
 
@@ -58,7 +58,7 @@ def run_evaluation(
     Args:
         config: resolved ``conf/evaluate.yaml``.
         agents: see :func:`egopose.pipeline.agent.load_agent`; all on the same takes.
-        names: of all takes of the material.
+        names: of all takes of the dataset.
         videos: of all takes; None where there is none to show.
         out: folder of the results.
 
@@ -69,10 +69,10 @@ def run_evaluation(
     failsafe = from_mapping(FailSafeSettings, config["failsafe"], f"{source}: failsafe")
     contact = from_mapping(ContactSettings, config["contact"], f"{source}: contact")
     planner = planner_settings(config.get("planner"))
-    split, threads, material = str(config["split"]), int(config["threads"]), agents[0].material
+    split, threads, dataset = str(config["split"]), int(config["threads"]), agents[0].dataset
     if split not in ("train", "test"):
         raise InputError(source, "split", f"must be train or test, not {split!r}")
-    fragments = list(material.train if split == "train" else material.test)
+    fragments = list(dataset.train if split == "train" else dataset.test)
     if not fragments:
         raise InputError(source, "split", f"the data has no {split} fragments")
     labels = fragment_names(names, fragments)
@@ -81,18 +81,18 @@ def run_evaluation(
     runs = [
         evaluate_agent(agent, fragments, labels, split, failsafe, contact, threads, window, planner) for agent in agents
     ]
-    guards = [failsafe.for_run(agent.config, planned_kappa(planner)) for agent in agents]
+    guards = [failsafe.for_run(agent.config, planned_threshold(planner)) for agent in agents]
     guarded = [failsafe_figures(run, guard, window) for run, guard in zip(runs, guards, strict=True)]
     interval, survive = config["interval"], config["survival"]
     comparison = report.compare_runs(runs, float(interval["level"]), int(interval["draws"]), int(interval["seed"]))
     survival = []
     for agent in agents:
-        env = agent.make_env(split, worlds=1)
+        env = agent.make_env(split, num_envs=1)
         torch.manual_seed(int(agent.config["seed"]))
-        start_policy, _ = build_networks(agent.config, agent.material, env)
+        start_policy, _ = build_networks(agent.config, agent.dataset, env)
         env.close()
         survival.append(
-            survival_figures(agent, start_policy, split, int(survive["worlds"]), int(survive["seed"]), threads)
+            survival_figures(agent, start_policy, split, int(survive["num_envs"]), int(survive["seed"]), threads)
         )
     about = {
         "command": shlex.join(sys.orig_argv),
@@ -118,7 +118,7 @@ def run_evaluation(
             continue
         path = folder / "side_by_side.mp4"
         motions = {"reference": result.reference, "estimate": result.motion}
-        write_side_by_side(path, material.humanoid, motions, video, fragment.start, int(config["video"]["size"]))
+        write_side_by_side(path, dataset.humanoid, motions, video, fragment.start, int(config["video"]["size"]))
         written.append(path)
     return Results(out, comparison, survival, guarded, written, report.rendered_notes(about))
 
@@ -127,8 +127,8 @@ def summary(results: Results) -> str:
     """What the terminal shows at the end."""
     lines = [tables.as_text(results.comparison, HEADLINE)]
     for run, figures in enumerate(results.survival):
-        parts = ", ".join(f"{name.replace('_', ' ')} {found['frames']:.1f}" for name, found in figures.items())
+        parts = ", ".join(f"{name.replace('_', ' ')} {result['frames']:.1f}" for name, result in figures.items())
         lines.append(f"frames survived (run {run}): {parts}")
-    lines += [f"fail-safe (run {run}): {triggers.as_text(found)}" for run, found in enumerate(results.failsafe)]
+    lines += [f"fail-safe (run {run}): {triggers.as_text(result)}" for run, result in enumerate(results.failsafe)]
     lines += [f"video: {path}" for path in results.videos]
     return "\n".join([*lines, *results.notes, f"all results: {results.folder}"])

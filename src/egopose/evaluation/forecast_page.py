@@ -26,7 +26,7 @@ from egopose.inference.outputs import RENDERED_NOTE
 from egopose.motion.io import read_motion
 from egopose.motion.motion import Motion
 from egopose.motion.rotations import Array
-from egopose.vision.overlay import ghost_frames
+from egopose.vision.overlay import overlay_frames
 
 _UNITS = {"E_pose": "rad", "E_vel": "", "A_accl": ""}
 _SPREAD = (0.1, 0.9)  # of the windows: the ground about the mean
@@ -100,19 +100,19 @@ def read_windows(folder: Path, methods: Sequence[str]) -> list[WindowMotions]:
     folders = sorted(path for path in (folder / "windows").glob("*") if path.is_dir())
     if not folders:
         raise InputError(folder, "windows", "there are none; `egopose evaluate` writes them")
-    found = []
+    result = []
     for path in folders:
         files = {methods[0]: path / "forecast.npz", **{m: path / other_file(m) for m in methods[1:]}}
         for needed in (path / "reference.npz", path / "forecast.npz"):
             if not needed.is_file():
                 raise InputError(needed, "path", "is missing: evaluate anew")
-        told = {method: read_motion(file) for method, file in files.items() if file.is_file()}
+        reported = {method: read_motion(file) for method, file in files.items() if file.is_file()}
         drawn = tuple(read_motion(file) for file in sorted(path.glob("future_*.npz")))
         truth = read_motion(path / "reference.npz")
-        if any(len(motion) != len(truth) for motion in (*told.values(), *drawn)):
+        if any(len(motion) != len(truth) for motion in (*reported.values(), *drawn)):
             raise InputError(path, "qpos", "the motions of a window differ in length")
-        found.append(WindowMotions(path.name, truth, told, drawn))
-    return found
+        result.append(WindowMotions(path.name, truth, reported, drawn))
+    return result
 
 
 def _about(results: Mapping[str, Any]) -> str:
@@ -132,10 +132,10 @@ def _figures(results: Mapping[str, Any]) -> str:
     for metric in METRICS:
         label = f"{metric} ({_UNITS[metric]})" if _UNITS[metric] else metric
         for r, horizon in enumerate(results["horizons_s"]):
-            found = [results["figures"][m][metric][r] for m in methods]
-            found += [results["ratios"][m][metric][r] for m in divided]
-            if any(f is not None for f in found):
-                rows.append([page.text(label), page.text(f"{horizon:.2f} s"), *(_cell(f) for f in found)])
+            result = [results["figures"][m][metric][r] for m in methods]
+            result += [results["ratios"][m][metric][r] for m in divided]
+            if any(f is not None for f in result):
+                rows.append([page.text(label), page.text(f"{horizon:.2f} s"), *(_cell(f) for f in result)])
     level = results.get("settings", {}).get("interval", {}).get("level")
     said = f"{100 * level:g} % intervals" if isinstance(level, float) else "Intervals"
     return page.table(header, rows) + f'<p class="note">{said} over runs and takes, by bootstrap.</p>'
@@ -166,8 +166,8 @@ def _over_horizon(results: Mapping[str, Any]) -> str:
 def _over_time(errors: Mapping[str, Array], fps: float, order: Sequence[str]) -> str:
     """Mean over windows at each frame; about ours the middle 80 % of the windows."""
     lines = []
-    for k, (method, found) in enumerate(errors.items()):
-        curves = found.mean(axis=2)
+    for k, (method, result) in enumerate(errors.items()):
+        curves = result.mean(axis=2)
         band = np.quantile(curves, _SPREAD, axis=0) if k == 0 else None
         lines.append(Line(method, np.arange(1, curves.shape[1] + 1) / fps, curves.mean(axis=0), band))
     note = f'<p class="note">First run. Ground: the middle {_SPREAD[1] - _SPREAD[0]:.0%} of the windows of ours.</p>'
@@ -177,11 +177,11 @@ def _over_time(errors: Mapping[str, Array], fps: float, order: Sequence[str]) ->
 def _coverage(results: Mapping[str, Any], fps: float) -> str:
     """How many true angles lie in the bands, frame by frame, beside how many should."""
     lines: list[Line] = []
-    for run, found in enumerate(results.get("coverage", [])):
-        inside = np.asarray(found["held_out_per_frame"], dtype=np.float64)
+    for run, result in enumerate(results.get("coverage", [])):
+        inside = np.asarray(result["held_out_per_frame"], dtype=np.float64)
         seconds = np.arange(1, len(inside) + 1) / fps
         if not lines:
-            lines.append(Line("asked for", seconds, np.full(len(inside), float(found["level"]))))
+            lines.append(Line("asked for", seconds, np.full(len(inside), float(result["level"]))))
         lines.append(Line(f"run {run}", seconds, inside))
     if not lines:
         return '<p class="note">No bands: no futures were drawn (forecast.samples=1).</p>'
@@ -189,7 +189,7 @@ def _coverage(results: Mapping[str, Any], fps: float) -> str:
 
 
 def _by_joint(errors: Mapping[str, Array], names: Sequence[str], order: Sequence[str]) -> str:
-    means = {method: found.mean(axis=(0, 1)) for method, found in errors.items()}
+    means = {method: result.mean(axis=(0, 1)) for method, result in errors.items()}
     rows = [[page.text(n), *(page.number(float(v[k]), 1) for v in means.values())] for k, n in enumerate(names)]
     chart = charts.bar_chart(names[1:], {m: v[1:] for m, v in means.items()}, "distance, roots aligned (mm)", order)
     return chart + page.table(["joint (mm)", *means], rows)
@@ -227,6 +227,6 @@ def _strip(window: WindowMotions, humanoid: HumanoidModel, size: int) -> Any:
     length = len(window.truth)
     times = np.array([length // 3, 2 * length // 3, length]) - 1
     ours = next(iter(window.told.values()))
-    ghosts = [(window.truth.qpos[times], TRUTH_COLOUR), *((d.qpos[times], FUTURE_COLOUR) for d in window.drawn)]
-    frames = ghost_frames(humanoid.mj_model, ours.qpos[times], ghosts, "forecast (green: true)", size)
+    overlays = [(window.truth.qpos[times], TRUTH_COLOUR), *((d.qpos[times], FUTURE_COLOUR) for d in window.drawn)]
+    frames = overlay_frames(humanoid.mj_model, ours.qpos[times], overlays, "forecast (green: true)", size)
     return np.concatenate(list(frames), axis=1)

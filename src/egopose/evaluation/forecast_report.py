@@ -17,7 +17,7 @@ from egopose.evaluation.statistics import Interval, mean_interval, ratio_interva
 from egopose.humanoid.model import HumanoidModel
 from egopose.inference.outputs import TakeVideo, file_name
 from egopose.motion.rotations import Array
-from egopose.vision.overlay import ghost_frames
+from egopose.vision.overlay import overlay_frames
 from egopose.vision.rendering import label_frame
 from egopose.vision.side_by_side import middle_square
 from egopose.vision.video import Frame, iter_frames, write_video
@@ -54,12 +54,12 @@ def compare_forecasts(
         ours: one of them, with one future a window.
         level, draws, seed: of the intervals.
     """
-    found: dict[str, dict[str, Array]] = {}
+    result: dict[str, dict[str, Array]] = {}
     for name, runs in methods.items():
-        found[name] = {m: np.stack([run.per_take(m) for run in runs]) for m in METRICS}
+        result[name] = {m: np.stack([run.per_take(m) for run in runs]) for m in METRICS}
         if runs[0].samples > 1:
             best = f"{name}, best of {runs[0].samples}"
-            found[best] = {m: np.stack([run.per_take(m, "best") for run in runs]) for m in METRICS}
+            result[best] = {m: np.stack([run.per_take(m, "best") for run in runs]) for m in METRICS}
     horizons = tuple(float(h) for h in methods[ours][0].horizons)
 
     def figure(table: Array) -> Interval | None:
@@ -71,10 +71,10 @@ def compare_forecasts(
     others = [name for name, runs in methods.items() if name != ours and runs[0].samples == 1]
     columns = range(len(horizons))
     figures = {
-        name: {m: [figure(table[m][:, :, r]) for r in columns] for m in METRICS} for name, table in found.items()
+        name: {m: [figure(table[m][:, :, r]) for r in columns] for m in METRICS} for name, table in result.items()
     }
     ratios = {
-        name: {m: [ratio(found[ours][m][:, :, r], found[name][m][:, :, r]) for r in columns] for m in METRICS}
+        name: {m: [ratio(result[ours][m][:, :, r], result[name][m][:, :, r]) for r in columns] for m in METRICS}
         for name in others
     }
     return ForecastComparison(horizons, ours, figures, ratios)
@@ -158,7 +158,7 @@ def write_futures_video(
     video: TakeVideo | None,
     size: int,
 ) -> None:
-    """The mean future (solid), the true one and drawn ones (ghosts), beside the end of what was seen.
+    """The mean future (solid), the true one and drawn ones (overlays), beside the end of what was seen.
 
     Args:
         path: the MP4.
@@ -174,8 +174,8 @@ def write_futures_video(
         RuntimeError: no OpenGL here.
     """
     fps = 1.0 / humanoid.control_dt
-    ghosts = [(truth, TRUTH_COLOUR), *((future, FUTURE_COLOUR) for future in drawn)]
-    bodies = ghost_frames(humanoid.mj_model, mean, ghosts, "forecast (green: true)", size)
+    overlays = [(truth, TRUTH_COLOUR), *((future, FUTURE_COLOUR) for future in drawn)]
+    bodies = overlay_frames(humanoid.mj_model, mean, overlays, "forecast (green: true)", size)
     write_video(path, _beside(bodies, _last_seen(window, video, fps, size)), fps)
 
 

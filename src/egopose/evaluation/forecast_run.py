@@ -28,7 +28,7 @@ from egopose.inference.forecast_contexts import SOURCES, past_states
 from egopose.inference.forecast_start import begin_forecasts
 from egopose.inference.forecaster import Forecasts, forecast
 from egopose.inference.outputs import RENDERED_NOTE, TakeVideo, file_name, write_footage, write_motion_files
-from egopose.inference.planner import Planner, followed_futures
+from egopose.inference.planner import Planner, followed_forecasts
 from egopose.inference.planner_settings import PlannerSettings, planner_settings
 from egopose.models.baselines.recurrent import RecurrentForecaster
 from egopose.motion.io import write_motion
@@ -36,7 +36,7 @@ from egopose.motion.motion import Motion
 from egopose.motion.rotations import Array
 from egopose.pipeline.agent import Agent
 from egopose.pipeline.baselines import forecast_qpos, load_baseline
-from egopose.tasks.dataset import Material
+from egopose.tasks.dataset import Dataset
 
 OURS, DRAWN, STILL = "ours", "ours, drawn", "standing still"
 
@@ -53,7 +53,7 @@ class ForecastSettings:
         noise_time: s, see :func:`egopose.inference.forecaster.forecast`.
         start: where forecasts begin, one of :data:`egopose.inference.forecast_contexts.SOURCES`.
         estimator: run directory of an estimation policy, read by ``start`` ``estimator``.
-        worlds: simulated side by side.
+        num_envs: simulated side by side.
         seed: of the drawn futures.
     """
 
@@ -64,14 +64,14 @@ class ForecastSettings:
     noise_time: float
     start: str
     estimator: str | None
-    worlds: int
+    num_envs: int
     seed: int
 
     def __post_init__(self) -> None:
         if self.start not in SOURCES:
             cause = f"must be one of {', '.join(SOURCES)}, not {self.start!r}"
             raise InputError("conf/evaluate.yaml", "forecast.start", cause)
-        for name in ("every", "samples", "worlds"):
+        for name in ("every", "samples", "num_envs"):
             if getattr(self, name) < 1:
                 raise InputError("conf/evaluate.yaml", f"forecast.{name}", "must be at least 1")
         if self.horizon is not None and self.horizon < 10:
@@ -90,7 +90,7 @@ def run_forecast_evaluation(
     Args:
         config: resolved ``conf/evaluate.yaml``.
         agents: see :func:`egopose.pipeline.agent.load_agent`; all on the same takes.
-        names: of all takes of the material.
+        names: of all takes of the dataset.
         videos: of all takes; None where there is none to show.
         out: folder of the results.
 
@@ -103,11 +103,11 @@ def run_forecast_evaluation(
     for agent in agents:
         if agent.config["task"].get("context") is None:
             raise InputError(agent.path, "task", "this run does not forecast, others of these do")
-    material, split = agents[0].material, str(config["split"])
-    humanoid, fps = material.humanoid, 1.0 / material.humanoid.control_dt
+    dataset, split = agents[0].dataset, str(config["split"])
+    humanoid, fps = dataset.humanoid, 1.0 / dataset.humanoid.control_dt
     windows = windows_of(agents[0], split, settings)
     labels = [f"{names[w.take]}_{w.start}" for w in windows]
-    truth = _truth(material, windows)
+    truth = _truth(dataset, windows)
     hands = [int(d) for d in humanoid.hand_dofs]
 
     planner = planner_settings(config.get("planner"))
@@ -117,9 +117,9 @@ def run_forecast_evaluation(
     for number, agent in enumerate(agents):
         pasts = _pasts(config, agent, windows, settings)
         for name, run in compared.items() if number == 0 else ():
-            told = _baseline_futures(agent, windows, pasts, str(run))
-            methods[name] = [score_forecasts(truth, windows, told, hands, fps)]
-            others[name] = told[:, 0]
+            reported = _baseline_futures(agent, windows, pasts, str(run))
+            methods[name] = [score_forecasts(truth, windows, reported, hands, fps)]
+            others[name] = reported[:, 0]
         states = begin_forecasts(agent, windows, pasts)
         mean = forecast_windows_of(agent, windows, states, 1, settings, int(config["threads"]), planner)
         methods[OURS].append(score_forecasts(truth, windows, mean.qpos, hands, fps))
@@ -130,8 +130,8 @@ def run_forecast_evaluation(
         if settings.samples > 1:
             drawn = forecast_windows_of(agent, windows, states, settings.samples, settings, int(config["threads"]))
             methods[DRAWN].append(score_forecasts(truth, windows, drawn.qpos, hands, fps))
-            bands, found = _bands(config, agent, drawn.qpos, truth, settings, hands)
-            coverage.append(found)
+            bands, result = _bands(config, agent, drawn.qpos, truth, settings, hands)
+            coverage.append(result)
         futures.append((mean, drawn, bands))
     methods = {name: runs for name, runs in methods.items() if runs}
 
@@ -145,7 +145,7 @@ def run_forecast_evaluation(
         f"{len({w.take for w in windows})} takes, split {split}; {windows[0].context} frames seen, "
         f"{windows[0].horizon} forecast, begun from the {settings.start}'s state.",
         "A figure at a horizon is the mean up to it; the mean over windows in a take, then over takes.",
-        *(_coverage_note(number, found, settings.level) for number, found in enumerate(coverage)),
+        *(_coverage_note(number, result, settings.level) for number, result in enumerate(coverage)),
         *([RENDERED_NOTE] if rendered else []),
     ]
     about = {
@@ -160,7 +160,7 @@ def run_forecast_evaluation(
         "notes": notes,
     }
     report.write_forecast_results(out, comparison, methods, windows, labels, about, notes)
-    written = _write_windows(out, config, material, windows, labels, truth, futures[0], others, videos)
+    written = _write_windows(out, config, dataset, windows, labels, truth, futures[0], others, videos)
     header, body = report.rows(comparison)
     widths = [max(len(line[i]) for line in [header, *body]) for i in range(len(header))]
     table = "\n".join("  ".join(c.ljust(w) for c, w in zip(line, widths, strict=True)) for line in [header, *body])
@@ -175,7 +175,7 @@ def windows_of(agent: Agent, split: str, settings: ForecastSettings) -> list[For
     """
     if split not in ("train", "test"):
         raise InputError("conf/evaluate.yaml", "split", f"must be train or test, not {split!r}")
-    fragments: Sequence[FragmentLike] = agent.material.train if split == "train" else agent.material.test
+    fragments: Sequence[FragmentLike] = agent.dataset.train if split == "train" else agent.dataset.test
     context = int(agent.config["task"]["context"])
     horizon = settings.horizon or int(agent.config["task"]["horizon"]) - 1
     windows = forecast_windows(fragments, context, horizon, settings.every)
@@ -189,9 +189,9 @@ def windows_of(agent: Agent, split: str, settings: ForecastSettings) -> list[For
 def _pasts(
     config: Mapping[str, Any], agent: Agent, windows: Sequence[ForecastWindow], settings: ForecastSettings
 ) -> Tensor:
-    """:func:`egopose.inference.forecast_contexts.past_states` as ``conf/evaluate.yaml`` says, some windows at a time."""
+    """:func:`~egopose.inference.forecast_contexts.past_states` as ``conf/evaluate.yaml`` says, some windows at a time."""
     failsafe = from_mapping(FailSafeSettings, config["failsafe"], "conf/evaluate.yaml: failsafe")
-    parts = [windows[at : at + settings.worlds] for at in range(0, len(windows), settings.worlds)]
+    parts = [windows[at : at + settings.num_envs] for at in range(0, len(windows), settings.num_envs)]
     threads = int(config["threads"])
     return torch.cat([past_states(agent, p, settings.start, settings.estimator, failsafe, threads) for p in parts])
 
@@ -205,7 +205,7 @@ def _baseline_futures(agent: Agent, windows: Sequence[ForecastWindow], pasts: Te
     model = load_baseline(run).model
     if not isinstance(model, RecurrentForecaster):
         raise InputError(run, "baseline", "forecasts nothing; name runs of baseline=erd or aclstm")
-    return forecast_qpos(model, pasts, agent.material, windows)[:, None]
+    return forecast_qpos(model, pasts, agent.dataset, windows)[:, None]
 
 
 def forecast_windows_of(
@@ -222,19 +222,19 @@ def forecast_windows_of(
     A body that follows a kinematic forecast looks ahead where there is a planner; one that remembers does not, as a
     planner's ways begin without a memory.
     """
-    parts, together = [], max(1, settings.worlds // samples)
+    parts, together = [], max(1, settings.num_envs // samples)
     for at in range(0, len(windows), together):
         part = windows[at : at + together]
         options = {"threads": threads, "whole_fragments": True, "falls_end": False}
         drawn = [window for window in part for _ in range(samples)]
-        env = agent.make_env(worlds=len(drawn), fragments=drawn, **options)
+        env = agent.make_env(num_envs=len(drawn), fragments=drawn, **options)
         qpos, qvel = (state[at : at + together] for state in states)
         horizon, seed = part[0].horizon, settings.seed + at
-        ahead, futures = None, agent.material.futures
+        ahead, futures = None, agent.dataset.forecasts
         if planner is not None and futures is not None:
-            now = torch.tensor([int(agent.material.takes.offsets[w.take]) + w.now for w in part])
-            copies = agent.make_env(worlds=len(part) * planner.samples, fragments=part, **options)
-            followed, row = followed_futures(futures, now)
+            now = torch.tensor([int(agent.dataset.takes.offsets[w.take]) + w.now for w in part])
+            copies = agent.make_env(num_envs=len(part) * planner.samples, fragments=part, **options)
+            followed, row = followed_forecasts(futures, now)
             ahead = Planner(copies, agent.actor, agent.critic, followed, planner, row)
         with torch_threads(1):
             parts.append(forecast(env, agent.actor, qpos, qvel, samples, horizon, seed, settings.noise_time, ahead))
@@ -244,9 +244,9 @@ def forecast_windows_of(
     return Forecasts(*(np.concatenate([getattr(p, name) for p in parts]) for name in ("qpos", "fallen", "diverged")))
 
 
-def _truth(material: Material, windows: Sequence[ForecastWindow]) -> Array:
-    reference = torch.as_tensor(material.reference["qpos"]).double().numpy()
-    return true_futures(reference, material.takes.offsets.tolist(), windows)
+def _truth(dataset: Dataset, windows: Sequence[ForecastWindow]) -> Array:
+    reference = torch.as_tensor(dataset.reference["qpos"]).double().numpy()
+    return true_futures(reference, dataset.takes.offsets.tolist(), windows)
 
 
 def _bands(
@@ -264,7 +264,7 @@ def _bands(
     states = begin_forecasts(agent, kept, _pasts(config, agent, kept, settings))
     futures = forecast_windows_of(agent, kept, states, settings.samples, settings, int(config["threads"]))
     known = quantile_bands(futures.qpos[..., used], settings.level)
-    known_truth = _truth(agent.material, kept)[..., used]
+    known_truth = _truth(agent.dataset, kept)[..., used]
     scale = fit_scale(known, known_truth, settings.level)
     calibrated, inside = bands.scaled(scale), bands.covers(truth[..., used])
     covered = calibrated.covers(truth[..., used])
@@ -291,7 +291,7 @@ def _coverage_note(run: int, found: Mapping[str, Any], level: float) -> str:
 def _write_windows(
     out: Path,
     config: Mapping[str, Any],
-    material: Material,
+    dataset: Dataset,
     windows: Sequence[ForecastWindow],
     labels: Sequence[str],
     truth: Array,
@@ -300,7 +300,7 @@ def _write_windows(
     videos: Sequence[TakeVideo | None],
 ) -> list[Path]:
     """Motions and bands of each window, and videos of the first ones; returns the videos."""
-    humanoid, fps = material.humanoid, 1.0 / material.humanoid.control_dt
+    humanoid, fps = dataset.humanoid, 1.0 / dataset.humanoid.control_dt
     mean, drawn, bands = futures
     used = [d for d in range(truth.shape[-1] - 7) if d not in {int(h) for h in humanoid.hand_dofs}]
     dof_names = [f"{joint.name}_{k}" for joint in humanoid.skeleton.joints[1:] for k in range(len(joint.dofs))]
@@ -312,8 +312,8 @@ def _write_windows(
         motions |= {} if drawn is None else {f"future_{k}": drawn.qpos[w, k] for k in range(min(3, len(drawn.qpos[w])))}
         for name, qpos in motions.items():
             write_motion_files(folder, name, Motion(humanoid.skeleton, qpos, fps, f"{label} {name}"))
-        for name, told in others.items():
-            write_motion(Motion(humanoid.skeleton, told[w], fps, f"{label} {name}"), folder / other_file(name))
+        for name, reported in others.items():
+            write_motion(Motion(humanoid.skeleton, reported[w], fps, f"{label} {name}"), folder / other_file(name))
         if (video := videos[window.take]) is not None:
             write_footage(folder, video, window.now + 1, fps)
         if bands is not None:

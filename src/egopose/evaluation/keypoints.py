@@ -111,9 +111,9 @@ def read_openpose(folder: str | Path, confidence: float) -> Array:
         people = card.get("people") if isinstance(card, dict) else None
         if not isinstance(people, list):
             raise InputError(file, "people", "is missing: this is no keypoint file of OpenPose")
-        found = [_person(file, person) for person in people]
-        if found:
-            best = max(found, key=lambda rows: float(rows[:, 2].mean()))
+        result = [_person(file, person) for person in people]
+        if result:
+            best = max(result, key=lambda rows: float(rows[:, 2].mean()))
             seen = best[:, 2] >= max(confidence, 1e-9)
             out[t, seen] = best[seen, :2]
     return out

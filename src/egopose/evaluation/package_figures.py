@@ -56,8 +56,8 @@ def _figures(raw: Mapping[str, Any], interval: Mapping[str, Any], method: str) -
     """Mean over held-out takes of each shown metric, with its interval; resets of the fail-safe a minute."""
     out: dict[str, Any] = {"takes": raw["takes"]}
     for label, scores in _scores(raw, method).items():
-        found = mean_interval([scores], float(interval["level"]), int(interval["draws"]), int(interval["seed"]))
-        out[label] = {"value": found.value, "low": found.low, "high": found.high}
+        result = mean_interval([scores], float(interval["level"]), int(interval["draws"]), int(interval["seed"]))
+        out[label] = {"value": result.value, "low": result.low, "high": result.high}
     if "resets" in raw:
         seconds = sum(raw["frames"]) / 30.0  # the control rate of every task here
         out["resets_per_minute"] = 60.0 * sum(raw["resets"]) / seconds
@@ -77,8 +77,8 @@ def _ratios(above: Mapping[str, Any], below: Mapping[str, Any], interval: Mappin
     ours, theirs, out = _scores(above, "first"), _scores(below, "other"), {}
     for label in ours.keys() & theirs.keys():
         level, draws, seed = float(interval["level"]), int(interval["draws"]), int(interval["seed"])
-        found = ratio_interval([ours[label]], [theirs[label]], level, draws, seed)
-        out[label] = {"value": found.value, "low": found.low, "high": found.high}
+        result = ratio_interval([ours[label]], [theirs[label]], level, draws, seed)
+        out[label] = {"value": result.value, "low": result.low, "high": result.high}
     return out
 
 

@@ -41,8 +41,8 @@ def write_results(
     reference = {m.key: m.scale * _mean([take.reference_scores.figure(m.key) for take in runs[0]]) for m in METRICS}
     resets = [[take.estimate.n_resets for take in run] for run in runs]
     diverged = sum(take.estimate.diverged for run in runs for take in run)
-    found = {"reference": reference, "resets_per_take": resets, "diverged": diverged}
-    write_json(folder / "results.json", {**about, **tables.as_dict(comparison), **found})
+    result = {"reference": reference, "resets_per_take": resets, "diverged": diverged}
+    write_json(folder / "results.json", {**about, **tables.as_dict(comparison), **result})
     runs_and_takes = (
         f"{len(runs)} run{'s' if len(runs) > 1 else ''} on {len(runs[0])} fragments, split {about['split']}."
     )

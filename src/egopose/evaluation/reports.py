@@ -24,8 +24,7 @@ _SOURCE = "conf/report.yaml"
 
 
 def evaluation_report(folder: Path, humanoid: HumanoidModel | None, overrides: Sequence[str] = ()) -> Path:
-    """Write the page of an evaluation's folder: :func:`egopose.evaluation.estimation_page.write_report`'s, or of forecasts
-    :func:`egopose.evaluation.forecast_page.write_forecast_page`'s."""
+    """Write the page of an evaluation's folder, of estimates or of forecasts."""
     config = compose_config("report", overrides)
     settings = from_mapping(ReportSettings, config["evaluation"], f"{_SOURCE}: evaluation")
     results = read_json(folder / "results.json", "results")

@@ -62,12 +62,12 @@ def take_triggers(estimate: Estimate, to_fall: Mapping[int, int | None], window:
     starts = [0, *np.flatnonzero(estimate.resets).tolist()]
     triggers, missed = [], []
     for first, end in zip(starts, [*starts[1:], frames], strict=True):
-        falls, told = (np.flatnonzero(flags[first:end]) + first for flags in (estimate.fallen, estimate.triggered))
-        if not len(told):
+        falls, reported = (np.flatnonzero(flags[first:end]) + first for flags in (estimate.fallen, estimate.triggered))
+        if not len(reported):
             # A start anew that nothing asked for: the physics broke.
             missed += [int(falls[0])] if len(falls) else [end] if end < frames else []
             continue
-        at = int(told[0])
+        at = int(reported[0])
         if len(falls) and falls[0] <= at:
             triggers.append(Trigger(at, LATE, int(falls[0]) - at))
         elif (lead := to_fall[at]) is not None:

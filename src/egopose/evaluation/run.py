@@ -27,7 +27,7 @@ def evaluate(values: Mapping[str, Any]) -> str:
     Raises:
         InputError: a checkpoint, the data or a setting cannot be used; names it.
     """
-    if values["reset_threshold"]["choose"]:
+    if values["threshold_search"]["enabled"]:
         return choose_threshold(values)
     given = values["checkpoint"]
     paths = [str(p) for p in given] if isinstance(given, list) else [str(given)]
@@ -44,5 +44,5 @@ def evaluate(values: Mapping[str, Any]) -> str:
     else:
         text = summary(run_evaluation(values, agents, names, videos, out))
     if values["report"]:
-        text += f"\nreport: {evaluation_report(out, agents[0].material.humanoid)}"
+        text += f"\nreport: {evaluation_report(out, agents[0].dataset.humanoid)}"
     return text

@@ -78,13 +78,13 @@ def read_jobs(folder: Path) -> list[Job]:
     Raises:
         InputError: there is none, or a file of one is damaged.
     """
-    found = [path for path in folder.iterdir() if path.is_dir() and (path / "config.yaml").is_file()]
-    found = [path for path in found if (path / "curves.csv").is_file()]
-    if not found:
+    result = [path for path in folder.iterdir() if path.is_dir() and (path / "config.yaml").is_file()]
+    result = [path for path in result if (path / "curves.csv").is_file()]
+    if not result:
         raise InputError(folder, "path", "neither an evaluation (results.json) nor a sweep of runs (JOB/curves.csv)")
-    found.sort(key=lambda path: (not path.name.isdigit(), int(path.name) if path.name.isdigit() else 0, path.name))
+    result.sort(key=lambda path: (not path.name.isdigit(), int(path.name) if path.name.isdigit() else 0, path.name))
     jobs = []
-    for path in found:
+    for path in result:
         evaluations = {
             results.parent.name: read_json(results, "results")
             for results in sorted(path.glob("evaluation/*/results.json"))
@@ -172,9 +172,9 @@ def _evaluations(jobs: Sequence[Job]) -> str:
             ours = next(iter(figures.values()))
             cells = []
             for metric in shown:
-                found = ours.get(metric.key)
-                between = (found["low"], found["high"]) if found and found.get("low") is not None else None
-                cells.append(page.number(found["value"] if found else None, metric.decimals, between))
+                result = ours.get(metric.key)
+                between = (result["low"], result["high"]) if result and result.get("low") is not None else None
+                cells.append(page.number(result["value"] if result else None, metric.decimals, between))
             rows.append([page.text(job.name), page.text(split), *cells])
     return page.table(["job", "split", *(f"{m.label}{f' ({m.unit})' if m.unit else ''}" for m in shown)], rows)
 

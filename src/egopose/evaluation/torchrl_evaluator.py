@@ -16,7 +16,7 @@ from egopose.core.errors import InputError
 from egopose.core.runtime import end_with_parent
 from egopose.evaluation.trial import trial_env, trial_figures
 from egopose.pipeline.agent import load_agent
-from egopose.tasks.dataset import Material
+from egopose.tasks.dataset import Dataset
 
 BACKENDS = ("thread", "process")
 
@@ -27,14 +27,14 @@ def checkpoint_evaluator(
     *,
     which: str = "best",
     split: str = "test",
-    worlds: int = 32,
+    num_envs: int = 32,
     seed: int = 10000,
     threads: int = 1,
-    material: Material | None = None,
+    dataset: Dataset | None = None,
 ) -> Evaluator:
     """TorchRL's evaluator of a trained policy, of estimation or forecasting; its figures are those of survival.
 
-    ``evaluator.evaluate()`` gives ``eval/frames`` (survived, mean over ``worlds`` episodes from starts that stay the
+    ``evaluator.evaluate()`` gives ``eval/frames`` (survived, mean over ``num_envs`` episodes from starts that stay the
     same), ``eval/fell`` and ``eval/reward``; ``trigger_eval`` and ``poll`` the same in the background.
 
     Args:
@@ -42,10 +42,10 @@ def checkpoint_evaluator(
         backend: ``thread`` or ``process``; there the checkpoint is loaded.
         which: of a run directory, the ``best`` or the ``latest`` checkpoint.
         split: ``test`` or ``train`` fragments.
-        worlds: episodes.
+        num_envs: episodes.
         seed: of their starts.
         threads: of the physics.
-        material: to run on; None for the run's own.
+        dataset: to run on; None for the run's own.
 
     Raises:
         InputError: there is no such checkpoint or backend.
@@ -53,8 +53,8 @@ def checkpoint_evaluator(
     _require(backend)
     folder = find_checkpoint(checkpoint, which)
     steps = int(read_json(folder, "config")["task"]["horizon"]) - 1
-    env = partial(_checkpoint_env, folder, material, split, worlds, seed, threads)
-    return _evaluator(env, partial(_checkpoint_policy, folder, material), backend, worlds, steps)
+    env = partial(_checkpoint_env, folder, dataset, split, num_envs, seed, threads)
+    return _evaluator(env, partial(_checkpoint_policy, folder, dataset), backend, num_envs, steps)
 
 
 def _require(backend: str) -> None:
@@ -62,14 +62,14 @@ def _require(backend: str) -> None:
         raise InputError("evaluator", "backend", f"must be one of {', '.join(BACKENDS)}, not {backend!r}")
 
 
-def _evaluator(make_env: Any, make_policy: Any, backend: str, worlds: int, steps: int) -> Evaluator:
+def _evaluator(make_env: Any, make_policy: Any, backend: str, num_envs: int, steps: int) -> Evaluator:
     return Evaluator(
         make_env,
         policy_factory=make_policy,
         backend=backend,
-        num_trajectories=worlds,
+        num_trajectories=num_envs,
         max_steps=0,  # a trial ends by itself
-        frames_per_batch=worlds * steps,
+        frames_per_batch=num_envs * steps,
         collector_kwargs={"auto_register_policy_transforms": False, "traj_format": "padded"},
         metrics_fn=trial_figures,
         init_fn=_one_thread if backend == "process" else None,
@@ -83,12 +83,12 @@ def _one_thread() -> None:
 
 
 def _checkpoint_env(
-    folder: Path, material: Material | None, split: str, worlds: int, seed: int, threads: int
+    folder: Path, dataset: Dataset | None, split: str, num_envs: int, seed: int, threads: int
 ) -> TransformedEnv:
-    agent = load_agent(folder, material)
-    env = agent.make_env(split, worlds=worlds, threads=threads)
+    agent = load_agent(folder, dataset)
+    env = agent.make_env(split, num_envs=num_envs, threads=threads)
     return trial_env(env, int(agent.config["task"]["horizon"]) - 1, seed)
 
 
-def _checkpoint_policy(folder: Path, material: Material | None, env: EnvBase | None = None) -> TensorDictModuleBase:
-    return load_agent(folder, material).actor
+def _checkpoint_policy(folder: Path, dataset: Dataset | None, env: EnvBase | None = None) -> TensorDictModuleBase:
+    return load_agent(folder, dataset).actor

@@ -1,6 +1,7 @@
 """What TorchRL's renderer asks for: an environment that shows the body from beside, and the trained policy.
 
-As ``--env egopose.evaluation.torchrl_render:make_env --policy egopose.evaluation.torchrl_render:make_policy`` of ``torchrl.render``.
+As ``--env egopose.evaluation.torchrl_render:make_env --policy egopose.evaluation.torchrl_render:make_policy`` of
+``torchrl.render``.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from torchrl.envs.transforms import Transform
 
 from egopose.envs.env import EgoPoseEnv
 from egopose.pipeline.agent import load_agent
-from egopose.tasks.dataset import Material
+from egopose.tasks.dataset import Dataset
 from egopose.vision.rendering import SceneRenderer
 
 
@@ -63,28 +64,28 @@ class SideView(Transform):
         return observation_spec
 
 
-def make_env(config: Any, size: int = 320, material: Material | None = None) -> TransformedEnv:
+def make_env(config: Any, size: int = 320, dataset: Dataset | None = None) -> TransformedEnv:
     """One world on the run's test fragments, with pictures.
 
     Args:
         config: of the renderer; its ``ckpt`` is a checkpoint folder.
         size: side of the pictures, pixels.
-        material: to run on; None for the run's own.
+        dataset: to run on; None for the run's own.
 
     Raises:
         InputError: the checkpoint cannot be used.
         RuntimeError: no OpenGL here.
     """
-    env = load_agent(config.ckpt, material).make_env("test", worlds=1)
+    env = load_agent(config.ckpt, dataset).make_env("test", num_envs=1)
     base = env.base_env
     assert isinstance(base, EgoPoseEnv)
     return TransformedEnv(env, SideView(base, size), auto_unwrap=False)
 
 
-def make_policy(ckpt_path: str | Path, material: Material | None = None) -> TensorDictModuleBase:
+def make_policy(ckpt_path: str | Path, dataset: Dataset | None = None) -> TensorDictModuleBase:
     """The trained actor; the renderer takes its mean action.
 
     Raises:
         InputError: the checkpoint cannot be used.
     """
-    return load_agent(ckpt_path, material).actor
+    return load_agent(ckpt_path, dataset).actor

@@ -60,10 +60,10 @@ class Trial(Transform):
         was, step = tensordict["running"], tensordict["trial_step"] + 1
         fall, running = next_tensordict["terminated"], was & ~next_tensordict["done"]
         over = (step >= self.steps) | ~running.any()
-        found = {"running": running, "survived": was & ~fall, "fell": was & fall, "trial_step": step}
+        result = {"running": running, "survived": was & ~fall, "fell": was & fall, "trial_step": step}
         ends = {"done": over, "truncated": over.clone(), "terminated": torch.zeros_like(over)}
         reward = next_tensordict["reward"] * was
-        for key, value in {**found, **ends, "reward": reward}.items():
+        for key, value in {**result, **ends, "reward": reward}.items():
             next_tensordict.set(key, value)
         return next_tensordict
 

@@ -121,14 +121,14 @@ def _near_floor(
         for geom in range(model.body_geomadr[body], model.body_geomadr[body] + model.body_geomnum[body]):
             centre, turn, size = data.geom_xpos[geom], data.geom_xmat[geom].reshape(3, 3), model.geom_size[geom]
             if model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_BOX:
-                found = centre + (signs * size) @ turn.T
+                result = centre + (signs * size) @ turn.T
             elif model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_CAPSULE:
-                found = centre + np.outer([-1, 1], turn[:, 2]) * size[1] - [0, 0, size[0]]
+                result = centre + np.outer([-1, 1], turn[:, 2]) * size[1] - [0, 0, size[0]]
             else:
-                found = centre[None] - [0, 0, size[-1]]
-            found = found[found[:, 2] <= touch]
-            points.append(found)
-            owners.append(np.full(len(found), owner))
+                result = centre[None] - [0, 0, size[-1]]
+            result = result[result[:, 2] <= touch]
+            points.append(result)
+            owners.append(np.full(len(result), owner))
     return np.concatenate(points), np.concatenate(owners)
 
 

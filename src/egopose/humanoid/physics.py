@@ -23,8 +23,8 @@ _FULL = mujoco.mjtState.mjSTATE_FULLPHYSICS
 # A world's clock starts here, not at zero: MuJoCo's answer to a state it cannot step is to reset the world in silence,
 # which sets its time to zero. A clock that is not where the steps should have brought it tells.
 _CLOCK_START = 1.0
-# A thread takes so many worlds in one call. Measured, with two lanes of 32 worlds on two threads: 8 or 16 at once are
-# as quick, 4 cost 1 % and 2 cost 3 %.
+# A thread takes so many worlds in one call. Measured, with two env_groups of 32 worlds on two threads: 8 or 16 at once
+# are as quick, 4 cost 1 % and 2 cost 3 %.
 _WORLDS_AT_ONCE = 8
 _CALLS_A_THREAD = 2  # at least, where there are worlds enough: threads that began apart end together
 
@@ -132,7 +132,7 @@ class BatchedPhysics:
 
     Args:
         model: compiled; shared, not copied, never changed.
-        n_worlds: N.
+        num_envs: N.
         substeps: steps of physics a control step.
         threads: that step worlds; in a whole :meth:`step` the caller's is one of them.
         body_ids: ``[B]`` bodies whose pose and mass make up the body state; default all but the world.
@@ -148,7 +148,7 @@ class BatchedPhysics:
     def __init__(
         self,
         model: mujoco.MjModel,
-        n_worlds: int,
+        num_envs: int,
         substeps: int,
         threads: int = 1,
         *,
@@ -158,9 +158,9 @@ class BatchedPhysics:
         history: int = 8,
         max_dumps: int = 32,
     ) -> None:
-        if min(n_worlds, substeps, threads, history) < 1:
-            raise ValueError("n_worlds, substeps, threads and history must be at least 1")
-        self.model, self.n_worlds, self.substeps, self.threads = model, n_worlds, substeps, threads
+        if min(num_envs, substeps, threads, history) < 1:
+            raise ValueError("num_envs, substeps, threads and history must be at least 1")
+        self.model, self.num_envs, self.substeps, self.threads = model, num_envs, substeps, threads
         self.body_ids = np.arange(1, model.nbody) if body_ids is None else np.asarray(body_ids)
         self._mass = model.body_mass[self.body_ids] / model.body_mass[self.body_ids].sum()
         self._max_speed = max_speed
@@ -182,19 +182,19 @@ class BatchedPhysics:
         mujoco.mj_getState(model, self._placer.data, self._default, _FULL)
         self._default[0] = _CLOCK_START
         #: ``[N, nstate]`` MuJoCo's full physics state of every world: time, qpos, qvel and the rest.
-        self.state = np.tile(self._default, (n_worlds, 1))
+        self.state = np.tile(self._default, (num_envs, 1))
         #: ``[N]`` worlds that diverged in the last step.
-        self.diverged = np.zeros(n_worlds, dtype=bool)
+        self.diverged = np.zeros(num_envs, dtype=bool)
         #: Worlds that diverged since the start.
         self.n_diverged = 0
-        self._taken = np.zeros(n_worlds, dtype=np.int64)
-        self._past_states = np.tile(self._default, (history, n_worlds, 1))
-        self._past_ctrl = np.zeros((history, n_worlds, model.nu))
+        self._taken = np.zeros(num_envs, dtype=np.int64)
+        self._past_states = np.tile(self._default, (history, num_envs, 1))
+        self._past_ctrl = np.zeros((history, num_envs, model.nu))
 
-        self._ctrl = np.zeros((n_worlds, model.nu))
-        self._wrench = np.zeros((n_worlds, 6))
-        self._after = np.empty((n_worlds, size))
-        self._warned = np.zeros(n_worlds, dtype=bool)
+        self._ctrl = np.zeros((num_envs, model.nu))
+        self._wrench = np.zeros((num_envs, 6))
+        self._after = np.empty((num_envs, size))
+        self._warned = np.zeros(num_envs, dtype=bool)
 
     @property
     def n_steps(self) -> int:
@@ -256,7 +256,7 @@ class BatchedPhysics:
 
     def end_step(self, worlds: slice = ALL) -> NDArray[np.bool_]:
         """Wait for what :meth:`begin_step` began; ``[n]`` which of these worlds diverged in it."""
-        first = worlds.indices(self.n_worlds)[0]
+        first = worlds.indices(self.num_envs)[0]
         order = self._begun.pop(first)
         order.done.get()
         for error in order.through:
@@ -275,7 +275,7 @@ class BatchedPhysics:
         return ~sound
 
     def _begin(self, ctrl: Array, worlds: slice, wrench: Array | None) -> _Order:
-        first, last, _ = worlds.indices(self.n_worlds)
+        first, last, _ = worlds.indices(self.num_envs)
         if ctrl.shape != (last - first, self.model.nu):
             raise ValueError(f"ctrl must be [{last - first}, {self.model.nu}], got {list(ctrl.shape)}")
         slot = self._taken[first] % len(self._past_states)

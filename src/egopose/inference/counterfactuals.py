@@ -16,7 +16,7 @@ _WORLDS = 256  # carried on side by side: a method that falls a lot triggers tho
 _OF_EACH_WORLD = ("physics.state", "take", "start", "stop", "frame", "placed")
 
 
-class Forks:
+class CounterfactualRollouts:
     """States kept at triggers: physics, episode and what the policy sees, memory included."""
 
     def __init__(self) -> None:
@@ -40,8 +40,8 @@ class Forks:
         """Frames from each fork to the fall that comes without a reset, or to physics that break.
 
         Args:
-            make_env: of so many worlds: the environment of the forks, with falls that do not end an episode and the
-                normaliser frozen.
+            make_env: of so many worlds: the environment of the counterfactuals, with falls that do not end an episode
+                and the normaliser frozen.
             actor: its mean action is taken.
             window: frames to look ahead; a take's end ends it sooner.
 

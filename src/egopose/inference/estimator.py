@@ -21,7 +21,7 @@ from egopose.envs.env import EgoPoseEnv
 from egopose.envs.test_time import Controller, prepare_for_test
 from egopose.humanoid.foot_geometry import out_of_floor
 from egopose.humanoid.model import HumanoidModel
-from egopose.inference.counterfactuals import Forks
+from egopose.inference.counterfactuals import CounterfactualRollouts
 from egopose.inference.failsafe import FailSafe
 from egopose.inference.planner import Planner
 from egopose.models.pose_regression import state_to_qpos
@@ -90,7 +90,7 @@ def estimate_takes(
     states: Tensor,
     guard: FailSafe,
     lookahead: int | None = None,
-    forks: Forks | None = None,
+    counterfactuals: CounterfactualRollouts | None = None,
     planner: Planner | None = None,
 ) -> list[Estimate]:
     """Run every world's fragment from its first frame to its last.
@@ -105,7 +105,7 @@ def estimate_takes(
         guard: the fail-safe, of as many worlds.
         lookahead: future frames that trainable contexts may see; None for the whole take. ``states`` and contexts that
             come with the observation are the caller's.
-        forks: is told the states in which the fail-safe triggered.
+        counterfactuals: is told the states in which the fail-safe triggered.
         planner: of as many bodies; None for the policy alone.
 
     Returns:
@@ -131,14 +131,14 @@ def estimate_takes(
             observation = critic(actor(observation))
             value = observation["state_value"].squeeze(-1)
             if planner is not None:
-                observation["action"] = observation["action"] + planner.addition(base)
+                observation["action"] = observation["action"] + planner.perturbation(base)
                 value = planner.value
             triggered = guard.update(value, body["xpos"][:, base.problem.humanoid.head, 2], t < lengths)
             frame = (body["qpos"], value, triggered, placed, observation["fallen"].squeeze(-1), diverged)
             for name, column in zip(rows, frame, strict=True):
                 rows[name].append(column)
-            if forks is not None and triggered.any():
-                forks.keep(base, observation, triggered.nonzero().squeeze(-1))
+            if counterfactuals is not None and triggered.any():
+                counterfactuals.keep(base, observation, triggered.nonzero().squeeze(-1))
             if t + 1 == int(lengths.max()):
                 break
             after = env.step(observation)["next"]

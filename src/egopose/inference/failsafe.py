@@ -1,7 +1,7 @@
 """When to give up on the humanoid's state and restart it from the regressor's (Yuan & Kitani 2019, section 3.3).
 
-Three modes. ``value``: reset when ``V(s_t) < kappa * V_mean``, V_mean the running mean of V over the take so far.
-``naive``: reset when the humanoid has fallen, its head under a height. ``off``: never.
+Three modes. ``value``: reset when ``V(s_t) < reset_threshold * V_mean``, V_mean the running mean of V over the take so
+far. ``naive``: reset when the humanoid has fallen, its head under a height. ``off``: never.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ from torch import Tensor
 from egopose.core.errors import InputError
 
 MODES = ("value", "naive", "off")
-#: Yuan & Kitani 2019, sections 3.3 and 4: kappa, and the discount their values have.
-PAPER_KAPPA, PAPER_DISCOUNT = 0.6, 0.95
+#: Yuan & Kitani 2019, sections 3.3 and 4: reset_threshold, and the discount their values have.
+PAPER_THRESHOLD, PAPER_DISCOUNT = 0.6, 0.95
 
 
 @dataclass(frozen=True)
@@ -27,8 +27,8 @@ class FailSafeSettings:
 
     Args:
         mode: one of ``value``, ``naive``, ``off``.
-        kappa: fraction of the mean value under which the state counts as unstable; None for :func:`paper_kappa` of the
-            discount the values were learned with, see :meth:`for_run`.
+        reset_threshold: fraction of the mean value under which the state counts as unstable; None for
+            :func:`paper_threshold` of the discount the values were learned with, see :meth:`for_run`.
         fallen_height: head height (m) under which the humanoid counts as fallen, for ``naive``.
 
     Raises:
@@ -36,7 +36,7 @@ class FailSafeSettings:
     """
 
     mode: str
-    kappa: float | None
+    reset_threshold: float | None
     fallen_height: float
 
     def __post_init__(self) -> None:
@@ -44,50 +44,55 @@ class FailSafeSettings:
             raise InputError("failsafe", "mode", f"must be one of {', '.join(MODES)}, not {self.mode!r}")
 
     def for_run(self, config: Mapping[str, Any], planned: float | None = None) -> FailSafeSettings:
-        """With ``kappa`` as it stands; where there is none ``planned``, which is meant for a planner's values, else the
-        paper's at the discount of a run's ``config``."""
-        if self.kappa is not None:
+        """With a threshold: its own, else ``planned`` (meant for a planner's values), else the paper's.
+
+        The paper's depends on the discount of a run's ``config``."""
+        if self.reset_threshold is not None:
             return self
-        return replace(self, kappa=paper_kappa(float(config["algo"]["gamma"])) if planned is None else planned)
+        return replace(
+            self, reset_threshold=paper_threshold(float(config["algo"]["gamma"])) if planned is None else planned
+        )
 
 
-def paper_kappa(discount: float) -> float:
-    """The paper's kappa of .6, which belongs to its discount of .95, for values of another discount.
+def paper_threshold(discount: float) -> float:
+    """The paper's reset_threshold of .6, which belongs to its discount of .95, for values of another discount.
 
     At an even reward r, a state whose episode ends in n frames is worth ``r (1 - discount^n) / (1 - discount)``, one
-    that goes on for ever ``r / (1 - discount)``: kappa times the latter is reached n frames before the end, where
-    ``kappa = 1 - discount^n``. What is kept is n, 17.9 frames; at .99 kappa becomes .164.
+    that goes on for ever ``r / (1 - discount)``: reset_threshold times the latter is reached n frames before the end,
+    where ``reset_threshold = 1 - discount^n``. What is kept is n, 17.9 frames; at .99 reset_threshold becomes .164.
 
     Raises:
         InputError: a discount that is not between 0 and 1.
     """
     if not 0.0 < discount < 1.0:
-        raise InputError("algo", "gamma", f"must lie between 0 and 1 for the fail-safe's kappa, not {discount}")
-    return 1.0 - (1.0 - PAPER_KAPPA) ** (math.log(discount) / math.log(PAPER_DISCOUNT))
+        raise InputError(
+            "algo", "gamma", f"must lie between 0 and 1 for the fail-safe's reset_threshold, not {discount}"
+        )
+    return 1.0 - (1.0 - PAPER_THRESHOLD) ** (math.log(discount) / math.log(PAPER_DISCOUNT))
 
 
 class FailSafe:
     """The fail-safe of N worlds that run side by side, one take each.
 
     Args:
-        worlds: N.
-        settings: see :class:`FailSafeSettings`; with a kappa.
+        num_envs: N.
+        settings: see :class:`FailSafeSettings`; with a reset_threshold.
 
     Raises:
-        ValueError: there is no kappa.
+        ValueError: there is no reset_threshold.
 
     Attributes:
         confidence: list over calls of ``[N]`` float64: V(s_t) over its running mean (1 at the first frame; NaN for
             worlds that were not active).
     """
 
-    def __init__(self, worlds: int, settings: FailSafeSettings) -> None:
-        if settings.kappa is None:
-            raise ValueError("kappa is not known: take settings.for_run(...)")
-        self.settings, self._kappa = settings, settings.kappa
+    def __init__(self, num_envs: int, settings: FailSafeSettings) -> None:
+        if settings.reset_threshold is None:
+            raise ValueError("reset_threshold is not known: take settings.for_run(...)")
+        self.settings, self._kappa = settings, settings.reset_threshold
         self.confidence: list[Tensor] = []
-        self._sum = torch.zeros(worlds, dtype=torch.float64)
-        self._count = torch.zeros(worlds, dtype=torch.float64)
+        self._sum = torch.zeros(num_envs, dtype=torch.float64)
+        self._count = torch.zeros(num_envs, dtype=torch.float64)
 
     def update(self, value: Tensor, head_height: Tensor, active: Tensor) -> Tensor:
         """Record a frame and say which worlds must be reset.

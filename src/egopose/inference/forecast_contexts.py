@@ -32,7 +32,7 @@ from egopose.motion.rotations import Array
 from egopose.pipeline.agent import Agent, load_agent
 from egopose.pipeline.regressor import load_regressor
 from egopose.pipeline.regressor_input import seen_in_store
-from egopose.tasks.dataset import Material
+from egopose.tasks.dataset import Dataset
 
 SOURCES = ("regressor", "estimator", "reference")
 
@@ -58,26 +58,26 @@ def past_states(
     Raises:
         InputError: a regressor, estimator or the flow they read is not there or does not fit.
     """
-    material, context = agent.material, windows[0].context
-    first = [int(material.takes.offsets[w.take]) + w.start for w in windows]
+    dataset, context = agent.dataset, windows[0].context
+    first = [int(dataset.takes.offsets[w.take]) + w.start for w in windows]
     if source == "reference":
         rows = torch.tensor(first)[:, None] + torch.arange(context)
-        states = humanoid_state({key: material.reference[key][rows.flatten()].double() for key in ("qpos", "qvel")})
+        states = humanoid_state({key: dataset.reference[key][rows.flatten()].double() for key in ("qpos", "qvel")})
         return states.unflatten(0, rows.shape)
     if source == "estimator":
         if estimator is None or failsafe is None:
             raise InputError("conf/evaluate.yaml", "forecast.estimator", "is missing: the run of an estimation policy")
         return _estimated(agent, first, context, estimator, failsafe, threads)
-    if material.regressor is None:
+    if dataset.regressor is None:
         raise InputError(agent.path, "regressor", "forecasts begin from the state regressor's state, and there is none")
-    model, made_with = load_regressor(material.regressor)
-    return context_states(model, _seen(agent, made_with), first, context).double()
+    model, source_config = load_regressor(dataset.regressor)
+    return context_states(model, _seen(agent, source_config), first, context).double()
 
 
-def _seen(agent: Agent, made_with: Mapping[str, Any]) -> Flow:
+def _seen(agent: Agent, source_config: Mapping[str, Any]) -> Flow:
     """What a regressor looks at of the store the agent was trained on."""
     config = agent.config
-    return seen_in_store(config, made_with["regressor"], TakeStore.open(store_folder(config)), flow_name(config))
+    return seen_in_store(config, source_config["regressor"], TakeStore.open(store_folder(config)), flow_name(config))
 
 
 def _estimated(
@@ -86,13 +86,13 @@ def _estimated(
 
     checkpoint = find_checkpoint(estimator)
     require_estimation(read_json(checkpoint, "config"), checkpoint)
-    model, made_with = load_regressor(run_folder(checkpoint) / "regressor")
-    flow, humanoid = _seen(agent, made_with), agent.material.humanoid
-    found = [seen_in(humanoid, model, np.asarray(flow[at : at + context]), made_with) for at in first]
-    seen = {key: torch.cat([clip[key] for clip in found]) for key in found[0]}
-    material = context_material(agent.material, first, context, seen)
-    policy = load_agent(checkpoint, material)
-    env = policy.make_env(worlds=len(first), threads=threads, whole_fragments=True, falls_end=False)
+    model, source_config = load_regressor(run_folder(checkpoint) / "regressor")
+    flow, humanoid = _seen(agent, source_config), agent.dataset.humanoid
+    result = [seen_in(humanoid, model, np.asarray(flow[at : at + context]), source_config) for at in first]
+    seen = {key: torch.cat([clip[key] for clip in result]) for key in result[0]}
+    dataset = context_dataset(agent.dataset, first, context, seen)
+    policy = load_agent(checkpoint, dataset)
+    env = policy.make_env(num_envs=len(first), threads=threads, whole_fragments=True, falls_end=False)
     guard = FailSafe(len(first), failsafe.for_run(policy.config))
     estimates = estimate_takes(env, policy.actor, policy.critic, policy.followed_states(), guard)
     env.close()
@@ -111,7 +111,7 @@ def _states(qpos: Array, resets: NDArray[np.bool_], regressed: Tensor, fps: floa
     return states
 
 
-def context_material(whole: Material, first: Sequence[int], context: int, seen: dict[str, Tensor]) -> Material:
+def context_dataset(whole: Dataset, first: Sequence[int], context: int, seen: dict[str, Tensor]) -> Dataset:
     """Each context as a take by itself, so that nothing an estimation policy reads reaches beyond it.
 
     Args:
@@ -125,7 +125,7 @@ def context_material(whole: Material, first: Sequence[int], context: int, seen: 
     heads = torch.as_tensor(reference["xpos"])[:, whole.humanoid.head, 2].double()
     pieces = [Fragment(number, 0, context) for number in range(len(first))]
     offsets = context * torch.arange(len(first))
-    return Material(
+    return Dataset(
         whole.humanoid,
         reference,
         TakeTable(offsets, torch.full_like(offsets, context), heads.unflatten(0, (-1, context)).amin(dim=1)),

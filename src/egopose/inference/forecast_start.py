@@ -25,13 +25,13 @@ def begin_forecasts(agent: Agent, windows: Sequence[ForecastWindow], pasts: Tens
     That is the last state of ``pasts [W, context, S]``; where the agent follows kinematic forecasts, it is where those
     begin, and from now on the agent follows, from these frames, the ones that have seen ``pasts`` alone.
     """
-    material = agent.material
-    now = torch.tensor([int(material.takes.offsets[w.take]) + w.now for w in windows])
-    where = torch.as_tensor(material.reference["qpos"][now]).double()
-    humanoid = material.humanoid
-    if material.futures is None:
+    dataset = agent.dataset
+    now = torch.tensor([int(dataset.takes.offsets[w.take]) + w.now for w in windows])
+    where = torch.as_tensor(dataset.reference["qpos"][now]).double()
+    humanoid = dataset.humanoid
+    if dataset.forecasts is None:
         return placed_states(pasts[:, -1].numpy(), where.numpy(), humanoid)
-    curves = ForecastCurves(agent.config, material, agent.path.resolve().parent.parent)
-    material.futures.put(curves(pasts), now)
-    qpos, qvel = material.futures.first_state(now, where, humanoid.joint_range)
+    curves = ForecastCurves(agent.config, dataset, agent.path.resolve().parent.parent)
+    dataset.forecasts.put(curves(pasts), now)
+    qpos, qvel = dataset.forecasts.first_state(now, where, humanoid.joint_range)
     return torch.from_numpy(out_of_floor(humanoid, qpos.numpy())), qvel

@@ -24,7 +24,7 @@ from egopose.motion.rotations import Array
 
 @dataclass(frozen=True)
 class Forecasts:
-    """Futures of W windows, K each.
+    """ReferenceForecasts of W windows, K each.
 
     Attributes:
         qpos: ``[W, K, H, nq]``; row 0 is the frame after the last one seen.
@@ -88,7 +88,7 @@ def forecast(
         for _ in range(horizon):
             observation = actor(observation)
             if planner is not None:
-                observation["action"] = observation["action"] + planner.addition(base)
+                observation["action"] = observation["action"] + planner.perturbation(base)
             if samples > 1:
                 observation["action"] = observation["loc"] + observation["scale"] * noise
                 fresh = torch.randn(noise.shape, generator=generator)

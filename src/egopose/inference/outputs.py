@@ -45,14 +45,14 @@ def write_footage(folder: Path, video: TakeVideo, start: int, fps: float) -> Non
         video: of the take.
         start: frame of the take that the folder's motions begin at. fps: of the motions.
     """
-    found = {
+    result = {
         "video": str(video.path.resolve()),
         "sync_offset": video.sync_offset,
         "start": start / fps,
         "taken_at": video.taken_at,
         "rendered": video.rendered,
     }
-    write_json(folder / FOOTAGE, found)
+    write_json(folder / FOOTAGE, result)
 
 
 def write_motion_files(folder: Path, name: str, motion: Motion) -> None:

@@ -25,7 +25,7 @@ from egopose.core.errors import InputError
 from egopose.envs.env import EgoPoseEnv
 from egopose.envs.forecasting_transforms import RecurrentStates
 from egopose.envs.mdp.rewards import Reward, build_reward
-from egopose.envs.reference_forecasts import Futures
+from egopose.envs.reference_forecasts import ReferenceForecasts
 from egopose.inference.planner_settings import PlannerSettings
 from egopose.models.pose_regression import state_to_qpos
 
@@ -44,25 +44,25 @@ def global_frame(entries: Mapping[str, Tensor]) -> Tensor:
     return entries["frame"].squeeze(-1)
 
 
-def followed_futures(futures: Futures, starts: Tensor) -> tuple[Tensor, Rows]:
+def followed_forecasts(forecasts: ReferenceForecasts, starts: Tensor) -> tuple[Tensor, Rows]:
     """What bodies follow that follow the forecasts from these frames.
 
     Args:
-        futures: forecasts.
+        forecasts: forecasts.
         starts: ``[W]`` global frames, each once.
 
     Returns:
         States z ``[W * (horizon + 1), S]`` of every step, and the rows of a body in its episode; behind the horizon the
         last.
     """
-    steps = torch.arange(futures.horizon + 1)
-    states = futures.states(starts.repeat_interleave(len(steps)), steps.repeat(len(starts)))
-    number = torch.full((futures.frames,), -1, dtype=torch.int64)
+    steps = torch.arange(forecasts.horizon + 1)
+    states = forecasts.states(starts.repeat_interleave(len(steps)), steps.repeat(len(starts)))
+    number = torch.full((forecasts.frames,), -1, dtype=torch.int64)
     number[starts] = torch.arange(len(starts))
 
     def row(entries: Mapping[str, Tensor]) -> Tensor:
         start, step = entries["episode_start"].squeeze(-1), entries["episode_step"].squeeze(-1)
-        return number[start] * len(steps) + step.clamp(max=futures.horizon)
+        return number[start] * len(steps) + step.clamp(max=forecasts.horizon)
 
     return states, row
 
@@ -76,7 +76,7 @@ class Planner:
         actor, critic: policy and value network, in evaluation mode; sequences of modules that read and write plain
             entries.
         states: ``[R, 2 nq - 3]`` the humanoid states the policy follows: the regressor's of every global frame, or
-            :func:`followed_futures`.
+            :func:`followed_forecasts`.
         settings: see :class:`PlannerSettings`.
         row: which of them.
 
@@ -123,7 +123,7 @@ class Planner:
         worlds = base.batch_size[0] // settings.samples
         self._plan = torch.zeros(worlds, settings.horizon + settings.every, len(hinges))
         self._age = 0
-        self._worth, self.value = torch.zeros(worlds), torch.zeros(worlds)
+        self._returns, self.value = torch.zeros(worlds), torch.zeros(worlds)
 
     def _what_is_followed(self, states: Tensor) -> tuple[dict[str, Tensor], Tensor]:
         """What the reward reads of the regressor's bodies, and their heads' height ``[F]`` m.
@@ -142,7 +142,7 @@ class Planner:
             heights.append(body.xpos[:, problem.humanoid.head, 2])
         return {name: torch.cat([view[name] for view in views]) for name in self._reward.reads}, torch.cat(heights)
 
-    def addition(self, base: EgoPoseEnv) -> Tensor:
+    def perturbation(self, base: EgoPoseEnv) -> Tensor:
         """``[N, nu]`` to add to the policy's mean action now, in the state of ``base`` (N worlds); planned anew where
         it is time to."""
         if self._age % self.settings.every == 0:
@@ -150,7 +150,7 @@ class Planner:
         self._age += 1
         head = torch.as_tensor(base.body_state()["xpos"])[:, base.problem.humanoid.head, 2]
         low = self._head_height[self._row(base.observe())] - head > self.settings.lost
-        self.value = torch.where(low, 0.0, self._worth)
+        self.value = torch.where(low, 0.0, self._returns)
         now = self._plan[:, 0].clone()
         self._plan = self._plan.roll(-1, 1)
         self._plan[:, -1] = 0.0
@@ -160,65 +160,71 @@ class Planner:
         """``worlds [n]`` were placed elsewhere: what was planned for them, and their value, hold no more."""
         self._plan[worlds], self._age = 0.0, 0
 
-    def _additions(self, count: int, wider: float = 1.0) -> Tensor:
+    def _perturbations(self, count: int, wider: float = 1.0) -> Tensor:
         """``[count, N, H, nu]`` additions drawn anew, straight lines between their knots."""
         settings, (worlds, _, size) = self.settings, self._plan.shape
-        knots = -(-(settings.horizon - 1) // settings.knot) + 1
+        knots = -(-(settings.horizon - 1) // settings.knot_spacing) + 1
         at_knots = torch.randn(count, worlds, knots, size, generator=self._generator) * (wider * self._deviation)
         at_knots *= 0.1 + 0.9 * torch.rand(count, worlds, 1, 1, generator=self._generator)
-        time = torch.arange(settings.horizon) / settings.knot
+        time = torch.arange(settings.horizon) / settings.knot_spacing
         left = time.long().clamp(max=max(knots - 2, 0))
         share = (time - left)[:, None]
         return torch.lerp(at_knots[:, :, left], at_knots[:, :, (left + 1).clamp(max=knots - 1)], share)
 
-    def _ways(self) -> Tensor:
+    def _candidates(self) -> Tensor:
         """``[K, N, H, nu]``: none, the plan so far, changes of it, and ways of their own."""
-        ways, plan = self._additions(self.settings.samples), self._plan[:, : self.settings.horizon]
-        ways[: self.settings.samples // 2] += plan
-        ways[0], ways[1] = 0.0, plan
-        return ways
+        candidates, plan = self._perturbations(self.settings.samples), self._plan[:, : self.settings.horizon]
+        candidates[: self.settings.samples // 2] += plan
+        candidates[0], candidates[1] = 0.0, plan
+        return candidates
 
-    def _refined(self, ways: Tensor, score: Tensor, wider: float = 1.0) -> Tensor:
-        """``[K, N, H, nu]`` between and about the best of ``ways``, as many or more, by their ``score [>= K, N]``.
+    def _refined(self, candidates: Tensor, score: Tensor, wider: float = 1.0) -> Tensor:
+        """``[K, N, H, nu]`` between and about the best of ``candidates``, by their ``score [>= K, N]``.
 
         Parts of the best, or of its change of the plan so far, means of the best ones, and the rest about such a mean.
         """
-        best = ways[score.topk(min(max(_ELITES), len(ways)), dim=0).indices, torch.arange(ways.shape[1])]
-        plan, means = ways[1], [best[:count].mean(0) for count in _ELITES]
-        found = [way for part in _PARTS for way in (torch.lerp(plan, best[0], part), part * best[0])]
-        found += [way for mean in means for way in (mean, 0.5 * mean, torch.lerp(plan, mean, 0.5))]
-        found = found[: self.settings.samples]
-        about = means[1] + _NARROWED * self._additions(self.settings.samples - len(found), wider)
-        return torch.cat([torch.stack(found), about])
+        best = candidates[
+            score.topk(min(max(_ELITES), len(candidates)), dim=0).indices, torch.arange(candidates.shape[1])
+        ]
+        plan, means = candidates[1], [best[:count].mean(0) for count in _ELITES]
+        result = [way for part in _PARTS for way in (torch.lerp(plan, best[0], part), part * best[0])]
+        result += [way for mean in means for way in (mean, 0.5 * mean, torch.lerp(plan, mean, 0.5))]
+        result = result[: self.settings.samples]
+        about = means[1] + _NARROWED * self._perturbations(self.settings.samples - len(result), wider)
+        return torch.cat([torch.stack(result), about])
 
     @torch.no_grad()
     def _look_ahead(self, base: EgoPoseEnv) -> None:
         settings, now = self.settings, base.state_dict()
-        ways = self._ways()
-        score, worth, low = self._tried(now, ways)
-        worlds = torch.arange(ways.shape[1])
-        for number in range(settings.rounds - 1 + settings.rescue):
-            rescue = number - (settings.rounds - 1)
-            if rescue < 0:
-                more = self._refined(ways, score)
-            elif not (low[score.argmax(0), worlds] > settings.sinking).any():
+        candidates = self._candidates()
+        score, returns, low = self._tried(now, candidates)
+        worlds = torch.arange(candidates.shape[1])
+        for number in range(settings.rounds - 1 + settings.recovery_rounds):
+            recovery_rounds = number - (settings.rounds - 1)
+            if recovery_rounds < 0:
+                more = self._refined(candidates, score)
+            elif not (low[score.argmax(0), worlds] > settings.height_drop).any():
                 break
             else:  # what balances a body does not catch one that falls
                 wide = settings.wider
-                more = self._refined(ways, score, wide) if rescue % 2 else self._additions(settings.samples, wide)
+                more = (
+                    self._refined(candidates, score, wide)
+                    if recovery_rounds % 2
+                    else self._perturbations(settings.samples, wide)
+                )
             tried = self._tried(now, more)
-            pairs = zip((ways, score, worth, low), (more, *tried), strict=True)
-            ways, score, worth, low = (torch.cat(pair) for pair in pairs)
-        most, change = score.amax(0), (ways - ways[1]).square().mean((2, 3))
-        best = torch.where(score >= most - settings.near, change, torch.inf).argmin(0)
+            pairs = zip((candidates, score, returns, low), (more, *tried), strict=True)
+            candidates, score, returns, low = (torch.cat(pair) for pair in pairs)
+        most, change = score.amax(0), (candidates - candidates[1]).square().mean((2, 3))
+        best = torch.where(score >= most - settings.tie_tolerance, change, torch.inf).argmin(0)
         # Chance finds small gains in any noise; to follow each of them is to tremble.
         enough = most - settings.margin
         best = torch.where(score[0] >= enough, 0, torch.where(score[1] >= enough, 1, best))
-        self._worth = worth[best, worlds]
-        self._plan[:, : settings.horizon] = ways[best, worlds]
+        self._returns = returns[best, worlds]
+        self._plan[:, : settings.horizon] = candidates[best, worlds]
 
-    def _tried(self, now: Mapping[str, Tensor], ways: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """What ``ways [K, N, H, nu]`` come to ``[K, N]`` from the bodies' state ``now``.
+    def _tried(self, now: Mapping[str, Tensor], candidates: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """What ``candidates [K, N, H, nu]`` come to ``[K, N]`` from the bodies' state ``now``.
 
         Returns:
             Rewards less the price of how they are come by; rewards alone; and by how many metres the head ends lower
@@ -227,12 +233,12 @@ class Planner:
         settings, copies, problem = self.settings, self._base, self._base.problem
         self._copy(now)
         seen = Entries(self._env.transform(copies.observe()).items())
-        worth = torch.zeros(copies.batch_size[0])
-        cost, low = torch.zeros_like(worth), torch.zeros_like(worth)
+        returns = torch.zeros(copies.batch_size[0])
+        cost, low = torch.zeros_like(returns), torch.zeros_like(returns)
         before, rate, kept = copies.physics.qvel.copy(), 1.0 / problem.humanoid.control_dt, 1.0
         for step in range(settings.horizon):
             run_parts(self._actor, seen)
-            body, after = copies.try_step(seen[self._action] + ways[:, :, step].flatten(0, 1))
+            body, after = copies.try_step(seen[self._action] + candidates[:, :, step].flatten(0, 1))
             row = self._row(after)
             followed = SimpleNamespace(**{name: rows.index_select(0, row) for name, rows in self._followed.items()})
             reward, _ = self._reward(body, followed, after["episode_step"].squeeze(-1))
@@ -240,15 +246,17 @@ class Planner:
             velocity = body.qvel.numpy()
             acceleration = torch.from_numpy(np.abs(velocity - before).mean(1) * rate)
             before = velocity
-            worth += kept * reward.float()
+            returns += kept * reward.float()
             cost += kept * (settings.acceleration * acceleration + settings.head * low).float()
             cost += _BROKEN * after["diverged"].squeeze(-1)
             kept *= settings.discount
             seen = self._env.transform._step(seen, Entries(after))
         run_parts(self._critic, seen)
-        worth += kept * seen["state_value"].squeeze(-1)
-        score, worth, low = (rows.unflatten(0, ways.shape[:2]) for rows in (worth - cost, worth, low.float()))
-        return score, worth, low
+        returns += kept * seen["state_value"].squeeze(-1)
+        score, returns, low = (
+            rows.unflatten(0, candidates.shape[:2]) for rows in (returns - cost, returns, low.float())
+        )
+        return score, returns, low
 
     def _copy(self, state: Mapping[str, Tensor]) -> None:
         """Put every body's copies where the body is, in ``state`` of its environment."""

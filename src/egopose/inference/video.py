@@ -17,19 +17,19 @@ from egopose.inference.estimator import estimate_takes
 from egopose.inference.failsafe import FailSafe, FailSafeSettings
 from egopose.inference.outputs import TakeVideo, write_footage, write_motion_files, write_side_by_side
 from egopose.inference.planner import Planner
-from egopose.inference.planner_settings import PlannerSettings, planned_kappa, planner_settings
+from egopose.inference.planner_settings import PlannerSettings, planned_threshold, planner_settings
 from egopose.inference.video_regression import (
     causal_regression,
     require_estimation,
     run_folder,
     seen_in,
     seen_live,
-    video_material,
+    video_dataset,
 )
 from egopose.motion.motion import Motion
 from egopose.pipeline.agent import Agent, load_agent
 from egopose.pipeline.regressor import load_regressor
-from egopose.pipeline.regressor_input import load_finder_of
+from egopose.pipeline.regressor_input import load_body_part_estimator_of
 from egopose.vision.features import extract_flow
 from egopose.vision.lens import Camera
 
@@ -39,7 +39,7 @@ def run_estimate(config: Mapping[str, Any], agent: Agent, pose_motion: Motion, v
 
     Args:
         config: resolved ``conf/estimate.yaml``.
-        agent: on :func:`video_material`.
+        agent: on :func:`video_dataset`.
         pose_motion: PoseReg's motion, for the picture.
         video: the MP4.
         out: folder of the results: ``estimate.bvh``, ``estimate.npz``, ``frames.csv``, ``side_by_side.mp4``.
@@ -53,20 +53,20 @@ def run_estimate(config: Mapping[str, Any], agent: Agent, pose_motion: Motion, v
     """
     failsafe = from_mapping(FailSafeSettings, config["failsafe"], "conf/estimate.yaml: failsafe")
     settings = allowed_planner(config)
-    guard = FailSafe(1, failsafe.for_run(agent.config, planned_kappa(settings)))
+    guard = FailSafe(1, failsafe.for_run(agent.config, planned_threshold(settings)))
     torch.set_num_threads(1)
     options = {"threads": 1, "whole_fragments": True, "falls_end": False}
-    env = agent.make_env("test", worlds=1, **options)
+    env = agent.make_env("test", num_envs=1, **options)
     lookahead, states = allowed_lookahead(config), agent.followed_states()
     planner = None
     if settings is not None:
-        copies = agent.make_env("test", worlds=settings.samples, **{**options, "threads": int(config["threads"])})
+        copies = agent.make_env("test", num_envs=settings.samples, **{**options, "threads": int(config["threads"])})
         planner = Planner(copies, agent.actor, agent.critic, states, settings)
     (estimate,) = estimate_takes(env, agent.actor, agent.critic, states, guard, lookahead, planner=planner)
     env.close()
     if planner is not None:
         planner.close()
-    humanoid = agent.material.humanoid
+    humanoid = agent.dataset.humanoid
     motion = estimate.motion(humanoid, pose_motion.name)
     out.mkdir(parents=True, exist_ok=True)
     write_motion_files(out, "estimate", motion)
@@ -122,20 +122,20 @@ def estimate_video(values: Mapping[str, Any]) -> Path:
     run = read_json(checkpoint, "config")
     require_estimation(run, checkpoint)
     humanoid = humanoid_of(run)
-    regressor, made_with = load_regressor(run_folder(checkpoint) / "regressor")
+    regressor, source_config = load_regressor(run_folder(checkpoint) / "regressor")
     lookahead = allowed_lookahead(values)
     camera = Camera.from_mapping(values["camera"], "camera")
     rate, offset = 1.0 / humanoid.control_dt, float(values["offset"])
-    finder = load_finder_of(made_with["regressor"])
-    flow = extract_flow(video, made_with["vision"]["flow"], rate, offset, camera=camera, finder=finder)
+    finder = load_body_part_estimator_of(source_config["regressor"])
+    flow = extract_flow(video, source_config["vision"]["flow"], rate, offset, camera=camera, finder=finder)
     overrides = None
     if lookahead is None:
-        seen = seen_in(humanoid, regressor, flow, made_with)
+        seen = seen_in(humanoid, regressor, flow, source_config)
     else:
-        causal = causal_regression(humanoid, regressor, made_with, run["task"], lookahead)
-        seen = seen_live(causal, regressor, flow, made_with)
+        causal = causal_regression(humanoid, regressor, source_config, run["task"], lookahead)
+        seen = seen_live(causal, regressor, flow, source_config)
         # What is seen live is smoothed already.
         overrides = {"task": {**run["task"], "action": {**run["task"]["action"], "smoothing": 0.0}}}
-    material, pose_motion = video_material(humanoid, seen, video.stem)
-    agent = load_agent(checkpoint, material, overrides=overrides)
+    dataset, pose_motion = video_dataset(humanoid, seen, video.stem)
+    agent = load_agent(checkpoint, dataset, overrides=overrides)
     return run_estimate(values, agent, pose_motion, video, out)

@@ -22,14 +22,14 @@ from egopose.models.predictions import predict_span
 from egopose.models.regressor import StateRegressor
 from egopose.motion.motion import Motion
 from egopose.pipeline.regressor import joint_targets
-from egopose.tasks.dataset import Material
+from egopose.tasks.dataset import Dataset
 from egopose.vision.features import encode
 
 
 def causal_regression(
     humanoid: HumanoidModel,
     regressor: StateRegressor,
-    made_with: Mapping[str, Any],
+    source_config: Mapping[str, Any],
     task: Mapping[str, Any],
     lookahead: int,
 ) -> CausalRegression:
@@ -38,22 +38,22 @@ def causal_regression(
     Args:
         humanoid: the run's.
         regressor: trained, in eval mode.
-        made_with: the groups ``vision`` and ``regressor`` it was trained with.
+        source_config: the groups ``vision`` and ``regressor`` it was trained with.
         task: the run's.
         lookahead: frames.
     """
     smoothing = float(task["action"].get("smoothing", 0.0)) / humanoid.control_dt
     joint_range = torch.as_tensor(humanoid.joint_range)
-    return CausalRegression(regressor, joint_range, lookahead, _crossed(made_with), smoothing)
+    return CausalRegression(regressor, joint_range, lookahead, _crossed(source_config), smoothing)
 
 
-def _crossed(made_with: Mapping[str, Any]) -> bool:
+def _crossed(source_config: Mapping[str, Any]) -> bool:
     """A policy trained on the tables of several fits reads the regressor's states for a context."""
-    return int(made_with["regressor"]["cross_fit"]) > 1
+    return int(source_config["regressor"]["cross_fit"]) > 1
 
 
 def seen_in(
-    humanoid: HumanoidModel, regressor: StateRegressor, flow: np.ndarray, made_with: Mapping[str, Any]
+    humanoid: HumanoidModel, regressor: StateRegressor, flow: np.ndarray, source_config: Mapping[str, Any]
 ) -> dict[str, Tensor]:
     """What the regressor makes of a whole video.
 
@@ -61,31 +61,31 @@ def seen_in(
         humanoid: the run's.
         regressor: trained, in eval mode.
         flow: ``[T, 2, S, S]`` of the video at the control rate, with a third plane where the regressor sees limbs.
-        made_with: the groups ``vision`` and ``regressor`` it was trained with.
+        source_config: the groups ``vision`` and ``regressor`` it was trained with.
 
     Returns:
         ``visual_features [T, D]``, ``visual_context [T, C]`` as a policy reads it, ``humanoid_state [T, S]``,
         ``joint_targets [T, nu]`` rad.
     """
-    batch = int(made_with["vision"]["encode_batch"])
+    batch = int(source_config["vision"]["encode_batch"])
     seen = predict_span(regressor, torch.from_numpy(flow), Span(0, len(flow)), batch)
     states = seen["humanoid_state"]
     return {
         "visual_features": seen["visual_features"],
-        "visual_context": regressor.normalise(states) if _crossed(made_with) else seen["visual_context"],
+        "visual_context": regressor.normalise(states) if _crossed(source_config) else seen["visual_context"],
         "humanoid_state": states,
         "joint_targets": joint_targets(states, humanoid),
     }
 
 
 def seen_live(
-    causal: CausalRegression, regressor: StateRegressor, flow: np.ndarray, made_with: Mapping[str, Any]
+    causal: CausalRegression, regressor: StateRegressor, flow: np.ndarray, source_config: Mapping[str, Any]
 ) -> dict[str, Tensor]:
     """As :func:`seen_in`, each frame as it would have been seen live; smoothed where the policy follows that."""
-    encoder, batch = regressor.encoder, int(made_with["vision"]["encode_batch"])
+    encoder, batch = regressor.encoder, int(source_config["vision"]["encode_batch"])
     features = encode(encoder, flow, batch)  # type: ignore[arg-type]  # a regressor of video has a FlowEncoder
-    found = [causal.push(frame, row) for frame, row in enumerate(features)]
-    rows = [*(row for row in found if row is not None), *causal.drain()]
+    result = [causal.push(frame, row) for frame, row in enumerate(features)]
+    rows = [*(row for row in result if row is not None), *causal.drain()]
     keys = ("visual_context", "humanoid_state", "joint_targets")
     return {"visual_features": features, **{key: torch.stack([getattr(row, key) for row in rows]) for key in keys}}
 
@@ -96,7 +96,7 @@ def require_estimation(run: Mapping[str, Any], checkpoint: str | Path) -> None:
         raise InputError(checkpoint, "task", "this run forecasts; an estimation policy is needed here")
 
 
-def video_material(humanoid: HumanoidModel, seen: Mapping[str, Tensor], name: str) -> tuple[Material, Motion]:
+def video_dataset(humanoid: HumanoidModel, seen: Mapping[str, Tensor], name: str) -> tuple[Dataset, Motion]:
     """What the policy needs of a video: a take whose reference is what the state regressor makes of it by itself.
 
     There is no mocap. PoseReg's motion, from the origin and heading along x, stands in its place: it gives the policy
@@ -108,7 +108,7 @@ def video_material(humanoid: HumanoidModel, seen: Mapping[str, Tensor], name: st
         name: of the take.
 
     Returns:
-        The material and PoseReg's motion.
+        The dataset and PoseReg's motion.
 
     Raises:
         InputError: fewer than 2 frames.
@@ -124,7 +124,7 @@ def video_material(humanoid: HumanoidModel, seen: Mapping[str, Tensor], name: st
     reference = reference_states(humanoid, motion)
     lowest = reference["xpos"][:, humanoid.head, 2].min().reshape(1)
     whole = [Fragment(0, 0, frames)]
-    material = Material(
+    dataset = Dataset(
         humanoid,
         reference,
         TakeTable(torch.tensor([0]), torch.tensor([frames]), lowest),
@@ -135,7 +135,7 @@ def video_material(humanoid: HumanoidModel, seen: Mapping[str, Tensor], name: st
         joint_targets=seen["joint_targets"],
         states=seen["humanoid_state"],
     )
-    return material, motion
+    return dataset, motion
 
 
 def run_folder(checkpoint: Path) -> Path:

@@ -30,7 +30,8 @@ def kernel_view(seen: Tensor, cells: int, limbs: int) -> Tensor:
     """What the kernel looks at of each frame, ``[B, 2 cells^2 + limbs]`` float32.
 
     Args:
-        seen: flow ``[B, 2, H, W]``, with a third plane where there are limbs (:func:`egopose.vision.body_parts.as_plane`).
+        seen: flow ``[B, 2, H, W]``, with a third plane where there are limbs
+            (:func:`egopose.vision.body_parts.as_plane`).
         cells: see :func:`flow_cells`.
         limbs: numbers of the third plane that count.
 

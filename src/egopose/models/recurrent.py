@@ -2,8 +2,8 @@
 
 phi, the context, is the last output of a forward LSTM over the frames seen, fixed for the rollout; nu_t, the memory, is
 the output of a forward LSTM over the states z_1 .. z_t. That one is TorchRL's ``LSTMModule``: step by step in acting,
-its hidden state going from step to step in the TensorDict (:class:`egopose.envs.forecasting_transforms.RecurrentStates` begins
-it), and whole sequences ``[N, T]`` at once under ``torchrl.modules.set_recurrent_mode`` while learning.
+its hidden state going from step to step in the TensorDict (:class:`egopose.envs.forecasting_transforms.RecurrentStates`
+begins it), and whole sequences ``[N, T]`` at once under ``torchrl.modules.set_recurrent_mode`` while learning.
 """
 
 from __future__ import annotations

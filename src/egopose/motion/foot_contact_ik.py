@@ -1,7 +1,8 @@
 """Plant the feet: soles that stand on the floor lie flat on it, none is under it.
 
-After :mod:`egopose.motion.ground_alignment` a standing foot may still be tilted by the few degrees mocap and retargeting leave,
-with its heel on the floor and its ball a centimetre above. A simulated foot rocks flat at once, and the body sinks.
+After :mod:`egopose.motion.ground_alignment` a standing foot may still be tilted by the few degrees mocap and
+retargeting leave, with its heel on the floor and its ball a centimetre above. A simulated foot rocks flat at once, and
+the body sinks.
 """
 
 from __future__ import annotations

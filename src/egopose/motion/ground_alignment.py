@@ -22,7 +22,7 @@ GRAVITY = 9.81
 
 
 @dataclass(frozen=True)
-class SettleSettings:
+class GroundAlignmentSettings:
     """See ``conf/data``.
 
     Args:
@@ -51,7 +51,7 @@ class SettleSettings:
 def settle(
     motion: Motion,
     sole_points: Array,
-    settings: SettleSettings | None = None,
+    settings: GroundAlignmentSettings | None = None,
     *,
     sole_edges: Array | None = None,
     center_of_mass: Array | None = None,
@@ -61,7 +61,7 @@ def settle(
     Args:
         motion: any.
         sole_points: ``[T, K, 3]`` world positions of heels and balls of the feet, m.
-        settings: see :class:`SettleSettings`.
+        settings: see :class:`GroundAlignmentSettings`.
         sole_edges: ``[T, E, 3]`` the soles' corners, m; default the sole points. A foot on its edge stands on these.
         center_of_mass: ``[T, 3]`` m. With it, a body near the floor that does not fall stands on the floor even where
             no sole point is slow enough to touch, and a body in the air falls as gravity has it.
@@ -69,7 +69,7 @@ def settle(
     Returns:
         The motion, with ``contacts [T, K]`` of its sole points; and the vertical shift of every frame ``[T]``, m.
     """
-    settings = settings or SettleSettings()
+    settings = settings or GroundAlignmentSettings()
     base = ground_height(sole_points, percentile=settings.percentile)
     # Capture floors tilt and rigs drift: the floor under a stride is the lowest a sole comes around it.
     window = max(1, round(settings.stride * motion.fps))
@@ -89,7 +89,7 @@ def settle(
 
 
 def _contact_shift(
-    edges: Array, touching: NDArray[np.bool_], com_height: Array | None, fps: float, settings: SettleSettings
+    edges: Array, touching: NDArray[np.bool_], com_height: Array | None, fps: float, settings: GroundAlignmentSettings
 ) -> Array:
     """``[T]`` m: the upward shift s that puts soles on the floor, by least squares over the whole clip.
 

@@ -18,11 +18,11 @@ from torchrl.envs import TransformedEnv
 from egopose.checkpoint.checkpoint import RunCheckpoint, find_checkpoint, read_json, require, verify
 from egopose.core.errors import InputError
 from egopose.envs.transforms import StateNormalizer
-from egopose.pipeline.dataset import run_material
+from egopose.pipeline.dataset import run_dataset
 from egopose.pipeline.environment import build_env
-from egopose.pipeline.forecaster import with_futures
+from egopose.pipeline.forecaster import with_forecasts
 from egopose.pipeline.networks import build_networks
-from egopose.tasks.dataset import Material, smoothed
+from egopose.tasks.dataset import Dataset, smoothed
 
 _STORE_GROUPS = {"data", "humanoid"}
 
@@ -34,7 +34,7 @@ class Agent:
     Attributes:
         actor, critic: in evaluation mode.
         config: resolved, of its run.
-        material: see :class:`Material`.
+        dataset: see :class:`Dataset`.
         make_env: ``make_env(split="test", worlds=1, ...)`` as :func:`build_env`, with the normaliser as trained and
             frozen.
         path: the checkpoint.
@@ -43,7 +43,7 @@ class Agent:
     actor: TensorDictModuleBase
     critic: TensorDictModuleBase
     config: dict[str, Any]
-    material: Material
+    dataset: Dataset
     make_env: Callable[..., TransformedEnv]
     path: Path
 
@@ -53,51 +53,51 @@ class Agent:
         Raises:
             InputError: there is no regressor.
         """
-        states = smoothed(self.material, float(self.config["task"]["action"].get("smoothing", 0.0))).states
+        states = smoothed(self.dataset, float(self.config["task"]["action"].get("smoothing", 0.0))).states
         if states is None:
             raise InputError(self.path, "regressor", "the policy starts from the state regressor, and there is none")
         return states
 
 
 def load_agent(
-    path: str | Path, material: Material | None = None, which: str = "best", overrides: Mapping[str, Any] | None = None
+    path: str | Path, dataset: Dataset | None = None, which: str = "best", overrides: Mapping[str, Any] | None = None
 ) -> Agent:
     """Networks and environment from a checkpoint.
 
     Args:
         path: a checkpoint folder or a run directory.
-        material: to run on; None for the data its configuration names, seen by the run's own state regressor.
+        dataset: to run on; None for the data its configuration names, seen by the run's own state regressor.
         which: of a run directory, the ``best`` or the ``latest`` checkpoint.
         overrides: whole config groups in place of the run's own (``{"data": {...}}``).
 
     Raises:
-        InputError: the checkpoint is damaged, or does not fit the material; the run was trained on other data, or its
+        InputError: the checkpoint is damaged, or does not fit the dataset; the run was trained on other data, or its
             state regressor is gone; names the field.
     """
     folder = find_checkpoint(path, which)
     metadata = verify(folder)
     own = read_json(folder, "config")
     config = {**own, **(overrides or {})}
-    if material is None:
+    if dataset is None:
         same_store = not _other_store(own, config)
-        material = run_material(config, folder.resolve().parent.parent, same_store)
-    material = with_futures(config, material, folder.resolve().parent.parent)
-    env = build_env(config, material, worlds=1)
+        dataset = run_dataset(config, folder.resolve().parent.parent, same_store)
+    dataset = with_forecasts(config, dataset, folder.resolve().parent.parent)
+    env = build_env(config, dataset, num_envs=1)
     require(metadata, folder, task=str(config["task"]["name"]), action_size=int(env.action_spec.shape[-1]))
-    actor, critic = build_networks(config, material, env)
+    actor, critic = build_networks(config, dataset, env)
     RunCheckpoint({"policy": actor, "critic": critic, "transforms": env}).restore(folder)
     statistics = copy.deepcopy(env.state_dict())
     env.close()
 
-    def make_env(split: str = "test", *, worlds: int = 1, **options: Any) -> TransformedEnv:
-        made = build_env(config, material, split, worlds=worlds, **options)
+    def make_env(split: str = "test", *, num_envs: int = 1, **options: Any) -> TransformedEnv:
+        made = build_env(config, dataset, split, num_envs=num_envs, **options)
         made.load_state_dict(statistics)
         for module in made.transform.modules():
             if isinstance(module, StateNormalizer):
                 module.freeze()
         return made
 
-    return Agent(actor.eval(), critic.eval(), config, material, make_env, folder)
+    return Agent(actor.eval(), critic.eval(), config, dataset, make_env, folder)
 
 
 def _other_store(own: Mapping[str, Any], config: Mapping[str, Any]) -> bool:

@@ -32,8 +32,8 @@ from egopose.models.pose_regression import integrate_root, pose_regression, spli
 from egopose.motion import rotations as rot
 from egopose.motion.motion import Motion
 from egopose.motion.rotations import Array
-from egopose.pipeline.dataset import load_material, run_material
-from egopose.tasks.dataset import Material
+from egopose.pipeline.dataset import load_dataset, run_dataset
+from egopose.tasks.dataset import Dataset
 from egopose.training.fitting import Fit, FitResult, FitSettings, State, fit
 from egopose.training.logging import write_provenance
 from egopose.training.loop import stop_signals
@@ -45,7 +45,7 @@ RESULT = "baseline.json"
 
 
 def run_baseline(
-    config: Mapping[str, Any], folder: Path, checkpoint: Path | None = None, material: Material | None = None
+    config: Mapping[str, Any], folder: Path, checkpoint: Path | None = None, dataset: Dataset | None = None
 ) -> FitResult:
     """Train the baseline ``config`` names in the run directory ``folder``; keeps the last checkpoint and one before.
 
@@ -53,17 +53,17 @@ def run_baseline(
         config: resolved ``conf/baseline.yaml``.
         folder: the run directory.
         checkpoint: to go on from, None for a new run.
-        material: None for what ``config`` names.
+        dataset: None for what ``config`` names.
 
     Raises:
         InputError: the configuration, the data or the checkpoint do not fit.
     """
-    if material is None:
-        material = load_material(config) if checkpoint is None else run_material(config, folder)
-    material.keep_regressor(folder)
-    material.keep_provenance(folder)
+    if dataset is None:
+        dataset = load_dataset(config) if checkpoint is None else run_dataset(config, folder)
+    dataset.keep_regressor(folder)
+    dataset.keep_provenance(folder)
     settings = FitSettings.from_config(config["baseline"]["optimiser"])
-    learner = _learner(config, material, settings)
+    learner = _learner(config, dataset, settings)
     training = config["training"]
     saved: State | None = None
     if checkpoint is not None:
@@ -166,19 +166,17 @@ def _own_settings(values: Mapping[str, Any]) -> dict[str, Any]:
     return {key: value for key, value in values.items() if key not in ("kind", "optimiser")}
 
 
-def _learner(
-    config: Mapping[str, Any], material: Material, settings: FitSettings
-) -> RecurrentLearner | PathPoseLearner:
+def _learner(config: Mapping[str, Any], dataset: Dataset, settings: FitSettings) -> RecurrentLearner | PathPoseLearner:
     store = TakeStore.open(store_folder(config))
     # Kinematics need no floor to stand on: every training frame may be learned from, as by the state regressor.
     pieces = split_takes(store.takes, config["data"]["split"], "train", supported_only=False)
     spans = [Span(*span) for span in global_spans(store, pieces)]
-    states = humanoid_state(material.reference).float()
+    states = humanoid_state(dataset.reference).float()
     seed, own = int(config["seed"]), _own_settings(config["baseline"])
     if _kind(config) == "recurrent":
         poses = states[:, : pose_state_size(states.shape[1])]
         recurrent = RecurrentSettings.from_config(own)
-        mirror = state_mirror(material.humanoid.skeleton).poses() if recurrent.mirror else None
+        mirror = state_mirror(dataset.humanoid.skeleton).poses() if recurrent.mirror else None
         return RecurrentLearner(poses, spans, recurrent, settings.batch, settings.validation_share, seed, mirror)
     path = PathPoseSettings.from_config(own)
     flow = store.flow(flow_name(config))
@@ -219,58 +217,58 @@ def load_baseline(run: str | Path) -> Baseline:
     return Baseline(model, settings)
 
 
-def path_pose_motion(model: PathPose, flow: Any, material: Material, fragment: FragmentLike, name: str = "") -> Motion:
+def path_pose_motion(model: PathPose, flow: Any, dataset: Dataset, fragment: FragmentLike, name: str = "") -> Motion:
     """The motion PathPose finds in a fragment's flow, placed where the reference begins; roots as PoseReg's.
 
     Args:
         model: trained.
         flow: ``[F, 2, S, S]`` of the store.
-        material: of the same store.
+        dataset: of the same store.
         fragment: in frames of its take.
         name: of the motion.
     """
-    rows = _rows(material, fragment)
-    return _placed(model.states(flow[rows]).numpy(), material, rows, name)
+    rows = _rows(dataset, fragment)
+    return _placed(model.states(flow[rows]).numpy(), dataset, rows, name)
 
 
-def regressed_motion(material: Material, fragment: FragmentLike, name: str = "") -> Motion:
+def regressed_motion(dataset: Dataset, fragment: FragmentLike, name: str = "") -> Motion:
     """PoseReg's motion of a fragment."""
-    rows = _rows(material, fragment)
-    assert material.states is not None
-    return _placed(material.states[rows].numpy(), material, rows, name)
+    rows = _rows(dataset, fragment)
+    assert dataset.states is not None
+    return _placed(dataset.states[rows].numpy(), dataset, rows, name)
 
 
-def _rows(material: Material, fragment: FragmentLike) -> slice:
-    offset = int(material.takes.offsets[fragment.take])
+def _rows(dataset: Dataset, fragment: FragmentLike) -> slice:
+    offset = int(dataset.takes.offsets[fragment.take])
     return slice(offset + fragment.start, offset + fragment.stop)
 
 
-def _placed(states: Array, material: Material, rows: slice, name: str) -> Motion:
-    humanoid = material.humanoid
-    first: Array = torch.as_tensor(material.reference["qpos"][rows.start]).double().numpy()
+def _placed(states: Array, dataset: Dataset, rows: slice, name: str) -> Motion:
+    humanoid = dataset.humanoid
+    first: Array = torch.as_tensor(dataset.reference["qpos"][rows.start]).double().numpy()
     start, heading, fps = first[:2], rot.heading(first[3:7]), 1.0 / humanoid.control_dt
     return pose_regression(states, humanoid.skeleton, start, heading, fps, humanoid.joint_range, name)
 
 
 def forecast_qpos(
-    model: RecurrentForecaster, contexts: Tensor, material: Material, windows: Sequence[ForecastWindow]
+    model: RecurrentForecaster, contexts: Tensor, dataset: Dataset, windows: Sequence[ForecastWindow]
 ) -> Array:
     """The futures ``[W, H, nq]`` of windows, from PoseReg's poses of the frames seen; roots integrated from there.
 
     Args:
         model: trained.
         contexts: ``[W, context, S]`` humanoid states z, see :func:`egopose.inference.context_states.context_states`.
-        material: for where the windows begin.
+        dataset: for where the windows begin.
         windows: all of one context and horizon.
     """
-    humanoid, size = material.humanoid, len(model.mean)
+    humanoid, size = dataset.humanoid, len(model.mean)
     fps, out = 1.0 / humanoid.control_dt, []
     poses = contexts[:, :, :size].float()
     futures = torch.cat([model.forecast(part, windows[0].horizon) for part in poses.split(64)])
     for window, clip in zip(windows, torch.cat([poses, futures], dim=1).double().numpy(), strict=True):
         # Neither the integration nor qpos reads joint velocities.
         states = np.concatenate([clip, np.zeros((len(clip), contexts.shape[-1] - size))], axis=1)
-        first: Array = torch.as_tensor(material.reference["qpos"][_rows(material, window).start]).double().numpy()
+        first: Array = torch.as_tensor(dataset.reference["qpos"][_rows(dataset, window).start]).double().numpy()
         parts = split_state(states, humanoid.joint_range)
         position, heading = integrate_root(parts, first[:2], rot.heading(first[3:7]), fps)
         qpos, _ = state_to_qpos(states, position, heading, humanoid.joint_range)

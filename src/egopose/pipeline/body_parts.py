@@ -21,7 +21,13 @@ from egopose.data.prepare_motion import PreparationSettings, reference_motion
 from egopose.humanoid.model import HumanoidModel
 from egopose.motion.io import read_motion
 from egopose.motion.rotations import Array
-from egopose.training.body_parts import FinderSettings, Pictures, held_out_figures, save_finder, train_finder
+from egopose.training.body_parts import (
+    BodyPartSettings,
+    Pictures,
+    held_out_figures,
+    save_body_part_estimator,
+    train_body_part_estimator,
+)
 from egopose.vision.body_part_pictures import PictureSettings, Scenes, draw_pictures, read_pictures
 from egopose.vision.flow import FlowConfig
 from egopose.vision.takes import RenderConfig
@@ -33,13 +39,13 @@ def motion_files(motions: Sequence[str], exclude: Sequence[str]) -> list[Path]:
     Raises:
         InputError: one names no file; nothing is left; two files have one name.
     """
-    found: set[Path] = set()
+    result: set[Path] = set()
     for pattern in motions:
         there = [Path(path) for path in glob(str(Path(pattern).expanduser())) if Path(path).is_file()]
         if not there:
             raise InputError(pattern, "motions", "there is no such file")
-        found.update(there)
-    kept = sorted(path for path in found if not any(fnmatch(path.name, one) for one in exclude))
+        result.update(there)
+    kept = sorted(path for path in result if not any(fnmatch(path.name, one) for one in exclude))
     if not kept:
         raise InputError("limbs", "motions", "exclude leaves none")
     names = [path.name for path in kept]
@@ -72,15 +78,15 @@ def base_clips(
     return out
 
 
-def make_finder(values: Mapping[str, Any]) -> dict[str, Any]:
-    """The way of ``conf/body_parts.yaml``, resolved; returns the finder's card. What is there already is not made again.
+def make_body_part_estimator(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Run ``conf/body_parts.yaml``, resolved; returns the estimator's card. What is there already is not made again.
 
     Raises:
         InputError: a motion or a setting cannot be used, or ``out`` holds what others made.
     """
     out, seed = Path(str(values["out"])).expanduser(), convert(values["seed"], int, "limbs", "seed")
     pictures = PictureSettings.from_config(values["pictures"])
-    training = FinderSettings.from_config(values["training"])
+    training = BodyPartSettings.from_config(values["training"])
     motions = convert(values["motions"], tuple[str, ...], "limbs", "motions")
     files = motion_files(motions, convert(values["exclude"], tuple[str, ...], "limbs", "exclude"))
     humanoid = humanoid_of(values)
@@ -118,21 +124,25 @@ def make_finder(values: Mapping[str, Any]) -> dict[str, Any]:
     def tell(steps: int, total: int, loss: float) -> None:
         print(f"step {steps} of {total}, loss {loss:.4f}", file=sys.stderr, flush=True)
 
-    model = train_finder(data.rows(slice(0, first_held_out)), humanoid.skeleton, training, seed, out / "training", tell)
+    model = train_body_part_estimator(
+        data.rows(slice(0, first_held_out)), humanoid.skeleton, training, seed, out / "training", tell
+    )
     held_out = data.rows(slice(first_held_out, len(data)))
     card["figures"] = held_out_figures(model, held_out, humanoid.skeleton, training.batch)
-    save_finder(out / "finder", model, humanoid.skeleton, scenes.flow, card, steps=round(training.epochs * len(data)))
+    save_body_part_estimator(
+        out / "finder", model, humanoid.skeleton, scenes.flow, card, steps=round(training.epochs * len(data))
+    )
     shutil.rmtree(out / "training", ignore_errors=True)
     return card
 
 
 def train_body_parts(values: Mapping[str, Any]) -> None:
-    """:func:`make_finder`, and what it found on the terminal.
+    """:func:`make_body_part_estimator`, and what it found on the terminal.
 
     Raises:
         InputError: see there.
     """
-    card = make_finder(values)
+    card = make_body_part_estimator(values)
     print(f"{card['held_out']} held-out pictures; share of the variance that is explained:")
     for group, figures in card["figures"].items():
         print(f"{group}: " + ", ".join(f"{name} {value:.2f}" for name, value in figures.items()))

@@ -15,11 +15,11 @@ from egopose.data.splits import split_takes
 from egopose.data.store import TakeStore
 from egopose.envs.mdp.observations import humanoid_state
 from egopose.pipeline.regressor import kept_tables, regressor_tables
-from egopose.tasks.dataset import Material, require_same_store, take_table
+from egopose.tasks.dataset import Dataset, require_same_store, take_table
 
 
-def load_material(config: Mapping[str, Any], progress: bool = True) -> Material:
-    """The material ``config`` names: data prepared and state regressor trained where that has not been done yet.
+def load_dataset(config: Mapping[str, Any], progress: bool = True) -> Dataset:
+    """The dataset ``config`` names: data prepared and state regressor trained where that has not been done yet.
 
     Raises:
         InputError: data cannot be found or used, the split leaves nothing, or a setting is wrong.
@@ -28,8 +28,8 @@ def load_material(config: Mapping[str, Any], progress: bool = True) -> Material:
     return _with_tables(config, store, *regressor_tables(config, store, humanoid_of(config), flow_name(config)))
 
 
-def run_material(config: Mapping[str, Any], run: Path, same_store: bool = True, progress: bool = True) -> Material:
-    """The material of a trained run, seen by the run's own state regressor ``run/regressor``; nothing is trained.
+def run_dataset(config: Mapping[str, Any], run: Path, same_store: bool = True, progress: bool = True) -> Dataset:
+    """The dataset of a trained run, seen by the run's own state regressor ``run/regressor``; nothing is trained.
 
     Args:
         config: the run's, resolved. Its data is prepared where that has not been done yet.
@@ -38,7 +38,7 @@ def run_material(config: Mapping[str, Any], run: Path, same_store: bool = True, 
         progress: show bars.
 
     Raises:
-        InputError: as :func:`load_material`; the data is not the run's, or neither run nor store holds a regressor.
+        InputError: as :func:`load_dataset`; the data is not the run's, or neither run nor store holds a regressor.
     """
     if same_store:
         # Before anything is prepared: hours could pass, only to be refused.
@@ -48,7 +48,7 @@ def run_material(config: Mapping[str, Any], run: Path, same_store: bool = True, 
     return _with_tables(config, store, *tables)
 
 
-def _with_tables(config: Mapping[str, Any], store: TakeStore, tables: TensorDictBase, weights: Path) -> Material:
+def _with_tables(config: Mapping[str, Any], store: TakeStore, tables: TensorDictBase, weights: Path) -> Dataset:
     return replace(
         _motion_of(config, store),
         visual_features=tables["visual_features"],
@@ -60,11 +60,11 @@ def _with_tables(config: Mapping[str, Any], store: TakeStore, tables: TensorDict
     )
 
 
-def motion_material(config: Mapping[str, Any], context_size: int = 128) -> Material:
+def motion_dataset(config: Mapping[str, Any], context_size: int = 128) -> Dataset:
     """For measuring speed without any video: noise for context, the reference's own states and joint angles.
 
     Raises:
-        InputError: as :func:`load_material`.
+        InputError: as :func:`load_dataset`.
     """
     motion = _motion_of(config, prepare(config, progress=False, flow=False))
     noise = torch.randn(len(motion.reference), context_size, generator=torch.Generator().manual_seed(0))
@@ -77,10 +77,10 @@ def motion_material(config: Mapping[str, Any], context_size: int = 128) -> Mater
     )
 
 
-def _motion_of(config: Mapping[str, Any], store: TakeStore) -> Material:
+def _motion_of(config: Mapping[str, Any], store: TakeStore) -> Dataset:
     split = config["data"]["split"]
     train, test = (split_takes(store.takes, split, part) for part in ("train", "test"))
-    return Material(humanoid_of(config), store.reference, take_table(store.takes), train, test)
+    return Dataset(humanoid_of(config), store.reference, take_table(store.takes), train, test)
 
 
 def absolute_paths(config: dict[str, Any]) -> dict[str, Any]:

@@ -19,18 +19,18 @@ from egopose.envs import build as envs
 from egopose.envs.aids import Aids
 from egopose.envs.forecasting_transforms import RecurrentStates, TimeLeft
 from egopose.envs.mdp.observations import humanoid_state
-from egopose.envs.reference_forecasts import FollowFuture
+from egopose.envs.reference_forecasts import TrackForecast
 from egopose.envs.transforms import RawState, StateNormalizer, TrackingError, VisualContext
 from egopose.models.recurrent import hidden_keys
-from egopose.tasks.dataset import Material, smoothed
+from egopose.tasks.dataset import Dataset, smoothed
 
 
 def build_env(
     config: Mapping[str, Any],
-    material: Material,
+    dataset: Dataset,
     split: str = "train",
     *,
-    worlds: int,
+    num_envs: int,
     threads: int = 1,
     seed: int = 0,
     whole_fragments: bool = False,
@@ -44,9 +44,9 @@ def build_env(
 
     Args:
         config: resolved.
-        material: see :class:`Material`.
+        dataset: see :class:`Dataset`.
         split: ``train`` or ``test`` fragments.
-        worlds: N.
+        num_envs: N.
         threads: of the physics.
         seed: of the starts.
         whole_fragments: each world runs its own fragment from end to end.
@@ -56,10 +56,10 @@ def build_env(
         aids: only for environments that a run collects in, ``workers`` of them.
 
     Raises:
-        InputError: the configuration asks for a table the material lacks, lets a forecast see the future, or the rooms
+        InputError: the configuration asks for a table the dataset lacks, lets a forecast see the future, or the rooms
             refuse it.
     """
-    material = smoothed(material, float(config["task"]["action"].get("smoothing", 0.0)))
+    dataset = smoothed(dataset, float(config["task"]["action"].get("smoothing", 0.0)))
     task = dict(config["task"])
     forecasts = task.get("context") is not None
     if forecasts:
@@ -68,18 +68,18 @@ def build_env(
         task["termination"] = {**task["termination"], "enabled": falls_end}
     try:
         problem = envs.build_problem(
-            material.humanoid,
-            material.reference,
-            material.takes,
+            dataset.humanoid,
+            dataset.reference,
+            dataset.takes,
             task,
             config["reward"],
-            action_reference=material.joint_targets,
-            futures=material.futures,
+            action_reference=dataset.joint_targets,
+            forecasts=dataset.forecasts,
         )
         base = envs.build_env(
             problem,
-            fragments or (material.train if split == "train" else material.test),
-            worlds,
+            fragments or (dataset.train if split == "train" else dataset.test),
+            num_envs,
             task,
             threads=threads,
             seed=seed,
@@ -91,20 +91,20 @@ def build_env(
     except (ValueError, TypeError) as error:
         raise error if isinstance(error, InputError) else InputError("configuration", "task", str(error)) from None
     transforms = [StateNormalizer(base.observation_spec["humanoid_state"].shape[-1])]
-    if material.futures is not None:
-        transforms.insert(0, _follow(config, material))
+    if dataset.forecasts is not None:
+        transforms.insert(0, _follow(config, dataset))
     elif config["model"]["context"]["source"] == "frozen":
-        if material.visual_context is None:
+        if dataset.visual_context is None:
             raise InputError("configuration", "model.context.source", "frozen needs a trained state regressor")
-        transforms.insert(0, VisualContext(material.visual_context))
-    if material.futures is None and "tracking_error" in config["model"]["inputs"]:
-        if material.states is None:
+        transforms.insert(0, VisualContext(dataset.visual_context))
+    if dataset.forecasts is None and "tracking_error" in config["model"]["inputs"]:
+        if dataset.states is None:
             raise InputError("configuration", "model.inputs", "tracking_error needs a trained state regressor")
         if "tracking_error_clip" not in task:
             raise InputError("configuration", "task.tracking_error_clip", "is missing")
-        scale = _state_scale(material, float(config["regressor"]["std_floor"]))
+        scale = _state_scale(dataset, float(config["regressor"]["std_floor"]))
         clip = float(task["tracking_error_clip"])
-        transforms.insert(0, TrackingError(material.states, material.takes.following(), scale, clip))
+        transforms.insert(0, TrackingError(dataset.states, dataset.takes.following(), scale, clip))
     if "discriminator" in config.get("algo", ()):
         transforms.insert(0, RawState())
     if forecasts:
@@ -115,16 +115,16 @@ def build_env(
     return TransformedEgoPoseEnv(base, *transforms)
 
 
-def _follow(config: Mapping[str, Any], material: Material) -> FollowFuture:
+def _follow(config: Mapping[str, Any], dataset: Dataset) -> TrackForecast:
     """What the policy sees of the forecasts it follows, as ``task.follow`` says."""
-    assert material.futures is not None
-    task, humanoid = config["task"], material.humanoid
+    assert dataset.forecasts is not None
+    task, humanoid = config["task"], dataset.humanoid
     if not isinstance(task.get("follow"), Mapping):
         raise InputError("configuration", "task.follow", "is missing: a forecaster is for task=forecasting_follow")
     lag = torch.as_tensor(humanoid.kd / humanoid.kp) * float(task["follow"]["velocity_feedforward"])
-    return FollowFuture(
-        material.futures,
-        _scale_of(humanoid_state(material.reference).float(), material, float(config["forecaster"]["std_floor"])),
+    return TrackForecast(
+        dataset.forecasts,
+        _scale_of(humanoid_state(dataset.reference).float(), dataset, float(config["forecaster"]["std_floor"])),
         torch.as_tensor(humanoid.rest_action),
         lag,
         float(task["follow"]["error_clip"]),
@@ -150,13 +150,13 @@ def _refuse_future(config: Mapping[str, Any]) -> None:
         raise InputError("configuration", "model.context", cause)
 
 
-def _state_scale(material: Material, floor: float) -> torch.Tensor:
+def _state_scale(dataset: Dataset, floor: float) -> torch.Tensor:
     """``[S]``: deviation of the regressor's states on the training frames, floored for still numbers."""
-    assert material.states is not None
-    return _scale_of(material.states, material, floor)
+    assert dataset.states is not None
+    return _scale_of(dataset.states, dataset, floor)
 
 
-def _scale_of(states: torch.Tensor, material: Material, floor: float) -> torch.Tensor:
-    offsets = material.takes.offsets
-    rows = [states[int(offsets[f.take]) + f.start : int(offsets[f.take]) + f.stop] for f in material.train]
+def _scale_of(states: torch.Tensor, dataset: Dataset, floor: float) -> torch.Tensor:
+    offsets = dataset.takes.offsets
+    rows = [states[int(offsets[f.take]) + f.start : int(offsets[f.take]) + f.stop] for f in dataset.train]
     return torch.cat(rows).std(dim=0).clamp_min(floor)

@@ -25,11 +25,11 @@ from egopose.data.spans import Span, cross_fit_blocks, group_blocks
 from egopose.data.splits import split_takes
 from egopose.data.store import TakeStore
 from egopose.envs.mdp.observations import humanoid_state
-from egopose.envs.reference_forecasts import Futures
+from egopose.envs.reference_forecasts import ReferenceForecasts
 from egopose.models.mirror import state_mirror
 from egopose.models.motion_forecast import ContinuedForecaster, KernelForecaster, MotionForecaster, spline_basis
 from egopose.pipeline.regressor import training_contexts
-from egopose.tasks.dataset import Material
+from egopose.tasks.dataset import Dataset
 from egopose.training.continued_forecast import (
     blank_continued_forecaster,
     continued_share,
@@ -53,44 +53,44 @@ class Members:
     continued_share: Tensor | None = None
 
 
-def with_futures(config: Mapping[str, Any], material: Material, run: Path) -> Material:
-    """The material with the run's forecasts, trained where that has not been done.
+def with_forecasts(config: Mapping[str, Any], dataset: Dataset, run: Path) -> Dataset:
+    """The dataset with the run's forecasts, trained where that has not been done.
 
-    Itself where the run has no forecaster, or the material has forecasts already.
+    Itself where the run has no forecaster, or the dataset has forecasts already.
 
     Args:
         config: resolved; its group ``forecaster`` says how, or is null.
-        material: with the states a regressor sees.
+        dataset: with the states a regressor sees.
         run: the run directory.
 
     Raises:
         InputError: a setting is wrong, there are no regressed states, or what is kept is damaged.
     """
-    if config.get("forecaster") is None or material.futures is not None:
-        return material
+    if config.get("forecaster") is None or dataset.forecasts is not None:
+        return dataset
     settings, _ = _settings(config)
     folder = run / FOLDER
     if not folder.is_dir():
-        _train(config, material, folder)
+        _train(config, dataset, folder)
     saved: dict[str, Tensor] = {}
-    if has_component(folder, "futures"):
-        RunCheckpoint({"futures": ComponentState(dict, saved.update)}).restore(folder, {"futures"})
+    if has_component(folder, "forecasts"):
+        RunCheckpoint({"forecasts": ComponentState(dict, saved.update)}).restore(folder, {"forecasts"})
     else:  # shipped without those of its training frames: others are put in where a forecast begins
-        assert material.states is not None
-        knots, size = spline_basis(settings.horizon + 1, settings.spacing, _fps(material))[0].shape[1], _size(material)
+        assert dataset.states is not None
+        knots, size = spline_basis(settings.horizon + 1, settings.spacing, _fps(dataset))[0].shape[1], _size(dataset)
         saved = {"coefficients": torch.zeros(0, knots, size), "starts": torch.zeros(0, dtype=torch.int64)}
-    return replace(material, futures=_futures(material, settings, saved["coefficients"], saved["starts"]))
+    return replace(dataset, forecasts=_futures(dataset, settings, saved["coefficients"], saved["starts"]))
 
 
-def still_futures(config: Mapping[str, Any], material: Material) -> Material:
-    """The material with forecasts of a body that stays as it is in the first frame."""
-    assert material.states is not None
+def still_forecasts(config: Mapping[str, Any], dataset: Dataset) -> Dataset:
+    """The dataset with forecasts of a body that stays as it is in the first frame."""
+    assert dataset.states is not None
     settings, _ = _settings(config)
-    knots = spline_basis(settings.horizon + 1, settings.spacing, _fps(material))[0].shape[1]
+    knots = spline_basis(settings.horizon + 1, settings.spacing, _fps(dataset))[0].shape[1]
     # The splines add up to one everywhere.
-    frames = len(material.reference)
-    curves = material.states[:1, None, : _size(material)].expand(frames, knots, -1)
-    return replace(material, futures=_futures(material, settings, curves, torch.arange(frames)))
+    frames = len(dataset.reference)
+    curves = dataset.states[:1, None, : _size(dataset)].expand(frames, knots, -1)
+    return replace(dataset, forecasts=_futures(dataset, settings, curves, torch.arange(frames)))
 
 
 class ForecastCurves:
@@ -98,7 +98,7 @@ class ForecastCurves:
 
     Args:
         config: of the run, resolved.
-        material: of its humanoid, with the states a regressor sees.
+        dataset: of its humanoid, with the states a regressor sees.
         run: the run directory.
 
     Attributes:
@@ -108,10 +108,10 @@ class ForecastCurves:
         InputError: what is kept in the run is damaged or not there.
     """
 
-    def __init__(self, config: Mapping[str, Any], material: Material, run: Path) -> None:
+    def __init__(self, config: Mapping[str, Any], dataset: Dataset, run: Path) -> None:
         settings, _ = _settings(config)
-        self.context, self._size = settings.context, _size(material)
-        self._members = _members(settings, run / FOLDER, self._size, _fps(material))
+        self.context, self._size = settings.context, _size(dataset)
+        self._members = _members(settings, run / FOLDER, self._size, _fps(dataset))
 
     def __call__(self, pasts: Tensor) -> Tensor:
         return _curves(self._members, pasts[..., : self._size].float())
@@ -122,19 +122,21 @@ def _settings(config: Mapping[str, Any]) -> tuple[ForecasterSettings, FitSetting
     return ForecasterSettings.from_config(values), FitSettings.from_config(config["forecaster"]["optimiser"])
 
 
-def _size(material: Material) -> int:
+def _size(dataset: Dataset) -> int:
     """P: numbers of a humanoid state that are its pose and not its joints' velocities."""
-    assert material.states is not None
-    return 11 + (material.states.shape[1] - 11) // 2
+    assert dataset.states is not None
+    return 11 + (dataset.states.shape[1] - 11) // 2
 
 
-def _fps(material: Material) -> float:
-    return 1.0 / material.humanoid.control_dt
+def _fps(dataset: Dataset) -> float:
+    return 1.0 / dataset.humanoid.control_dt
 
 
-def _futures(material: Material, settings: ForecasterSettings, coefficients: Tensor, starts: Tensor) -> Futures:
-    frames = len(material.reference)
-    return Futures(coefficients, starts, frames, settings.horizon, settings.spacing, _fps(material))
+def _futures(
+    dataset: Dataset, settings: ForecasterSettings, coefficients: Tensor, starts: Tensor
+) -> ReferenceForecasts:
+    frames = len(dataset.reference)
+    return ReferenceForecasts(coefficients, starts, frames, settings.horizon, settings.spacing, _fps(dataset))
 
 
 @torch.no_grad()
@@ -155,23 +157,23 @@ def _curve(members: Members, contexts: Tensor) -> Tensor:
     return torch.lerp(curve, of(members.continued), members.continued_share)
 
 
-def _train(config: Mapping[str, Any], material: Material, folder: Path) -> None:
+def _train(config: Mapping[str, Any], dataset: Dataset, folder: Path) -> None:
     """Fit all networks; write ``folder`` whole or not at all."""
-    if material.states is None:
+    if dataset.states is None:
         raise InputError("configuration", "forecaster", "needs a trained state regressor")
     settings, optimiser = _settings(config)
     store = TakeStore.open(store_folder(config))
     pieces = split_takes(store.takes, config["data"]["split"], "train", supported_only=False)
     spans = [Span(*span) for span in global_spans(store, pieces)]
-    size = _size(material)
-    truth = humanoid_state(material.reference).float()[:, :size]
+    size = _size(dataset)
+    truth = humanoid_state(dataset.reference).float()[:, :size]
     # No shorter than the least context: a stretch without one has nothing to say.
     ends = [torch.arange(s.start + settings.context - 1, s.stop) for s in spans]
     starts = torch.cat([torch.zeros(0, dtype=torch.int64), *ends])
-    rows = training_contexts(config, store, material.humanoid, flow_name(config), starts, settings.context)[..., :size]
+    rows = training_contexts(config, store, dataset.humanoid, flow_name(config), starts, settings.context)[..., :size]
     seen = Contexts.at(rows, starts, len(truth))
-    mirror = state_mirror(material.humanoid.skeleton).poses()
-    hands, seed, fps = [int(d) for d in material.humanoid.hand_dofs], int(config["seed"]), _fps(material)
+    mirror = state_mirror(dataset.humanoid.skeleton).poses()
+    hands, seed, fps = [int(d) for d in dataset.humanoid.hand_dofs], int(config["seed"]), _fps(dataset)
 
     def members(fragments: Sequence[Span], label: str) -> Members:
         out: list[MotionForecaster] = []
@@ -216,7 +218,7 @@ def _train(config: Mapping[str, Any], material: Material, folder: Path) -> None:
     part = folder.with_name(f"{FOLDER}.part")
     shutil.rmtree(part, ignore_errors=True)
     made: dict[str, Any] = {"members": nn.ModuleList(whole.networks)}
-    made["futures"] = ComponentState(lambda: table, lambda _: None)
+    made["forecasts"] = ComponentState(lambda: table, lambda _: None)
     if whole.kernel is not None:
         sizes = {"centres": torch.tensor(len(whole.kernel.kernel.centres))}
         made["kernel"], made["sizes"] = whole.kernel, ComponentState(lambda: sizes, lambda _: None)

@@ -13,11 +13,11 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase
 
 from egopose.models.policy import PolicySettings, build_actor, build_critic
-from egopose.tasks.dataset import Material
+from egopose.tasks.dataset import Dataset
 
 
 def build_networks(
-    config: Mapping[str, Any], material: Material, env: EnvBase
+    config: Mapping[str, Any], dataset: Dataset, env: EnvBase
 ) -> tuple[TensorDictModuleBase, TensorDictModuleBase]:
     """Actor and critic for ``env``'s observations, their start drawn from torch's generator.
 
@@ -26,7 +26,7 @@ def build_networks(
     """
     settings = PolicySettings.from_config(config["model"])
     widths = {name: spec.shape[-1] for name, spec in env.observation_spec.items() if name != "reward_terms"}
-    bounds = torch.stack([material.takes.offsets, material.takes.offsets + material.takes.lengths], dim=1)
-    names = [f"{joint.name}_{k}" for joint in material.humanoid.skeleton.joints for k in range(len(joint.dofs))]
-    actor = build_actor(settings, widths, env.action_spec.shape[-1], material.visual_features, bounds, dof_names=names)
-    return actor, build_critic(settings, widths, material.visual_features, bounds)
+    bounds = torch.stack([dataset.takes.offsets, dataset.takes.offsets + dataset.takes.lengths], dim=1)
+    names = [f"{joint.name}_{k}" for joint in dataset.humanoid.skeleton.joints for k in range(len(joint.dofs))]
+    actor = build_actor(settings, widths, env.action_spec.shape[-1], dataset.visual_features, bounds, dof_names=names)
+    return actor, build_critic(settings, widths, dataset.visual_features, bounds)

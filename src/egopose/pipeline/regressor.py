@@ -39,7 +39,7 @@ from egopose.models.mirror import state_mirror
 from egopose.models.predictions import Flow, predict_takes
 from egopose.models.regressor import StateRegressor
 from egopose.models.regressor_settings import RegressorSettings
-from egopose.pipeline.regressor_input import finder_fingerprint, finder_of, seen_in_store
+from egopose.pipeline.regressor_input import body_part_estimator_name, body_part_fingerprint, seen_in_store
 from egopose.training.blended_regressor import KernelSettings, blend
 from egopose.training.past_contexts import past_contexts
 from egopose.training.regressor import Progress, State, TrainingResult, build_regressor, train_regressor
@@ -53,9 +53,9 @@ def regressor_name(config: Mapping[str, Any], store: TakeStore, flow_name: str) 
     parts = [store.fingerprint, flow_name, config["vision"]["encoder"], config["regressor"], config["data"]["split"]]
     if _by_subject(config):
         parts.append("cross-fitted by subject")
-    finder = finder_of(config["regressor"])
+    finder = body_part_estimator_name(config["regressor"])
     if finder is not None:
-        parts.append(finder_fingerprint(finder))
+        parts.append(body_part_fingerprint(finder))
     return "regressor-" + hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()[:12]
 
 
@@ -116,13 +116,15 @@ def kept_tables(
         made_by_it = _is_trained(store, name) and _weights_checksums(folder) == wanted
         if made_by_it and store.table_card(name).get("flow") == flow_name:
             return store.table(name), weights
-    model, made_with = load_regressor(weights)
+    model, source_config = load_regressor(weights)
     size = humanoid_state(store.reference[:1]).shape[1]
-    if made_with["state_size"] != size:
-        raise InputError(weights, "state_size", f"is {made_with['state_size']}, the store's states have {size} numbers")
+    if source_config["state_size"] != size:
+        raise InputError(
+            weights, "state_size", f"is {source_config['state_size']}, the store's states have {size} numbers"
+        )
     print(f"predicting {store.frames_total} frames with {weights}", file=sys.stderr, flush=True)
-    seen = seen_in_store(config, made_with["regressor"], store, flow_name)
-    return TensorDict(_predict(model, store, humanoid, seen, _settings(made_with)), [store.frames_total]), weights
+    seen = seen_in_store(config, source_config["regressor"], store, flow_name)
+    return TensorDict(_predict(model, store, humanoid, seen, _settings(source_config)), [store.frames_total]), weights
 
 
 def _network_config(config: Mapping[str, Any]) -> dict[str, Any] | None:
@@ -145,10 +147,10 @@ def _is_trained(store: TakeStore, name: str) -> bool:
 def _weights_checksums(folder: Path) -> dict[str, str]:
     """Of the tensors and the settings they belong to; the manifest beside them also tells when they were saved."""
     try:
-        found = read_json_file(folder / CHECKSUMS, CHECKSUMS)
+        result = read_json_file(folder / CHECKSUMS, CHECKSUMS)
     except (OSError, ValueError) as error:
         raise InputError(folder, CHECKSUMS, f"cannot be read: {error}") from None
-    return {file: digest for file, digest in found.items() if file.startswith("components/")}
+    return {file: digest for file, digest in result.items() if file.startswith("components/")}
 
 
 def _predict(
@@ -263,7 +265,7 @@ def _blend(
     """From a cross-fitted F of the store to a blended one, its tables cross-fitted likewise."""
     settings = _settings(config)
     network_name = regressor_name(network_config, store, flow_name)
-    network, made_with = load_regressor(store.root / "regressors" / network_name)
+    network, source_config = load_regressor(store.root / "regressors" / network_name)
     seen = seen_in_store(config, config["regressor"], store, flow_name, keep=True)
     print(f"blending a kernel regression with {network_name}", file=sys.stderr, flush=True)
     blended = blend(
@@ -285,10 +287,10 @@ def _blend(
     tables = _with_targets(blended.model, tables, humanoid, settings)
     centres = len(blended.kernels[0].centres)
     axes = [kernel.centres.shape[1] for kernel in blended.kernels]
-    sizes = {**made_with, "regressor": config["regressor"], "centres": centres, "axes": axes}
-    finder = finder_of(config["regressor"])
+    sizes = {**source_config, "regressor": config["regressor"], "centres": centres, "axes": axes}
+    finder = body_part_estimator_name(config["regressor"])
     if finder is not None:
-        sizes["finder"] = finder_fingerprint(finder)
+        sizes["finder"] = body_part_fingerprint(finder)
     card = {**store.table_card(network_name), "shares": blended.shares, "centres": centres}
     _keep(store, name, blended.model, tables, sizes, card)
 
@@ -349,8 +351,8 @@ def _load_part(part: Path) -> State | None:
     if not part.is_dir():
         return None
     state: State = {}
-    found = RunCheckpoint({"training": ComponentState(dict, state.update)}).restore(part)
-    print(f"going on after epoch {found['iteration']}, saved in {part}", file=sys.stderr, flush=True)
+    result = RunCheckpoint({"training": ComponentState(dict, state.update)}).restore(part)
+    print(f"going on after epoch {result['iteration']}, saved in {part}", file=sys.stderr, flush=True)
     return state
 
 
@@ -392,8 +394,8 @@ def load_regressor(weights: str | Path) -> tuple[StateRegressor, dict[str, Any]]
         blank = [KernelRegression(seen, int(kept), centres, size) for seen, kept in zip(inputs, axes, strict=True)]
         model = blended_regressor(model, blank, kernel.cells, windows, kernel.limb_numbers)
     RunCheckpoint({"regressor": model}).restore(folder)
-    finder = finder_of(config["regressor"])
-    if finder is not None and config.get("finder") not in (None, finder_fingerprint(finder)):
+    finder = body_part_estimator_name(config["regressor"])
+    if finder is not None and config.get("finder") not in (None, body_part_fingerprint(finder)):
         raise InputError(folder, "finder", f"it was made with another limb finder {finder!r} than this egopose has")
     return model.eval(), config
 

@@ -16,19 +16,19 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from egopose.checkpoint.body_parts import load_finder
+from egopose.checkpoint.body_parts import load_body_part_estimator
 from egopose.data.preparation import video_of
 from egopose.data.store import TakeStore
 from egopose.models.predictions import Flow
-from egopose.vision.body_parts import LimbFinder, as_plane
-from egopose.vision.features import extract_limbs
+from egopose.vision.body_parts import BodyPartEstimator, as_plane
+from egopose.vision.features import extract_body_parts
 from egopose.vision.flow import FlowConfig
 from egopose.vision.lens import Camera
 
 _KEY = "limbs"
 
 
-class FlowAndLimbs:
+class FlowAndBodyParts:
     """Flow ``[F, 2, S, S]`` and rows ``[F, N]`` as one table ``[F, 3, S, S]``, put together as it is read."""
 
     def __init__(self, flow: Tensor, rows: Tensor) -> None:
@@ -47,7 +47,7 @@ class FlowAndLimbs:
         return np.concatenate([flow, as_plane(rows, flow.shape[-1])], axis=1)
 
 
-def finder_of(regressor: Mapping[str, Any]) -> str | None:
+def body_part_estimator_name(regressor: Mapping[str, Any]) -> str | None:
     """The limb finder's name in a group ``regressor``, None where only flow is seen."""
     kernel = regressor.get("kernel")
     return None if kernel is None else kernel.get(_KEY)
@@ -55,19 +55,19 @@ def finder_of(regressor: Mapping[str, Any]) -> str | None:
 
 def planes_of(regressor: Mapping[str, Any]) -> int:
     """Planes of a frame that a group ``regressor`` looks at: flow's two, a third with limbs."""
-    return 2 if finder_of(regressor) is None else 3
+    return 2 if body_part_estimator_name(regressor) is None else 3
 
 
-def load_finder_of(regressor: Mapping[str, Any]) -> LimbFinder | None:
+def load_body_part_estimator_of(regressor: Mapping[str, Any]) -> BodyPartEstimator | None:
     """The limb finder of a group ``regressor``. Raises InputError: there is none of that name."""
-    name = finder_of(regressor)
-    return None if name is None else load_finder(name)
+    name = body_part_estimator_name(regressor)
+    return None if name is None else load_body_part_estimator(name)
 
 
-def finder_fingerprint(name: str) -> str:
+def body_part_fingerprint(name: str) -> str:
     """Of a finder's weights: other weights, other rows."""
     digest = hashlib.sha256()
-    for key, value in sorted(load_finder(name).state_dict().items()):
+    for key, value in sorted(load_body_part_estimator(name).state_dict().items()):
         digest.update(key.encode() + np.ascontiguousarray(value.numpy()).tobytes())
     return digest.hexdigest()
 
@@ -87,29 +87,29 @@ def seen_in_store(
     Raises:
         InputError: the store lacks flow, or a video is not there.
     """
-    flow, name = store.flow(flow_name), finder_of(regressor)
+    flow, name = store.flow(flow_name), body_part_estimator_name(regressor)
     if name is None:
         return flow
-    table = f"limbs-{hashlib.sha256(json.dumps([flow_name, finder_fingerprint(name)]).encode()).hexdigest()[:12]}"
+    table = f"limbs-{hashlib.sha256(json.dumps([flow_name, body_part_fingerprint(name)]).encode()).hexdigest()[:12]}"
     if store.has_table(table):
-        return FlowAndLimbs(flow, store.table(table)[_KEY])
-    rows = _find_limbs(config, store, flow, load_finder(name))
+        return FlowAndBodyParts(flow, store.table(table)[_KEY])
+    rows = _find_body_parts(config, store, flow, load_body_part_estimator(name))
     if keep:
         store.write_table(table, {_KEY: rows}, {"flow": flow_name, "finder": name})
-    return FlowAndLimbs(flow, rows)
+    return FlowAndBodyParts(flow, rows)
 
 
-def _find_limbs(config: Mapping[str, Any], store: TakeStore, flow: Tensor, finder: LimbFinder) -> Tensor:
+def _find_body_parts(config: Mapping[str, Any], store: TakeStore, flow: Tensor, finder: BodyPartEstimator) -> Tensor:
 
     print(f"finding limbs in {store.frames_total} pictures", file=sys.stderr, flush=True)
     if not all(take.rendered for take in store.takes):
-        told = "the limb finder has never seen a filmed body: compare with regressor.kernel.limbs=null"
-        print(f"note: {told}", file=sys.stderr, flush=True)
+        reported = "the limb finder has never seen a filmed body: compare with regressor.kernel.limbs=null"
+        print(f"note: {reported}", file=sys.stderr, flush=True)
     settings = FlowConfig(**dict(config["vision"]["flow"]))
     rows = []
     for index, take in enumerate(store.takes):
         camera = Camera.from_mapping(take.camera, take.name) if take.camera else None
         seen = np.asarray(flow[store.frames(index)])
         video = video_of(config, store, index)
-        rows.append(extract_limbs(video, seen, settings, finder, store.fps, take.sync_offset, camera))
+        rows.append(extract_body_parts(video, seen, settings, finder, store.fps, take.sync_offset, camera))
     return torch.from_numpy(np.concatenate(rows))

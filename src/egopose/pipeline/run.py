@@ -25,7 +25,7 @@ from egopose.envs.mdp.observations import humanoid_state
 from egopose.models.recurrent import collecting_policy
 from egopose.pipeline.environment import build_env
 from egopose.pipeline.networks import build_networks
-from egopose.tasks.dataset import Material
+from egopose.tasks.dataset import Dataset
 from egopose.training.adversarial import AdversarialPPO, DiscriminatorSettings
 from egopose.training.exploration import SigmaSchedule, sigma_buffers
 from egopose.training.loop import Evaluation, LoopSettings, Run, interrupts_held
@@ -36,7 +36,7 @@ _LOOP_IN_ALGO = ("iterations", "steps_per_iteration")
 _LOOP_IN_TRAINING = ("total_steps", "max_seconds", "checkpoint_every", "keep_last", "evaluate_every")
 
 
-def build_run(config: Mapping[str, Any], folder: Path, material: Material) -> Run:
+def build_run(config: Mapping[str, Any], folder: Path, dataset: Dataset) -> Run:
     """The run ``config`` describes, not yet begun.
 
     Raises:
@@ -46,27 +46,27 @@ def build_run(config: Mapping[str, Any], folder: Path, material: Material) -> Ru
     loop = {name: algo.pop(name, ...) for name in _LOOP_IN_ALGO}
     loop |= {name: training.get(name, ...) for name in _LOOP_IN_TRAINING}
     settings = LoopSettings.from_config(loop)
-    material.keep_regressor(folder)
-    material.keep_provenance(folder)
+    dataset.keep_regressor(folder)
+    dataset.keep_provenance(folder)
     collector_settings = CollectorSettings.from_config(config["collector"])
     ppo_settings = PPOSettings.from_config(algo)
 
     for seed in (torch.manual_seed, random.seed, np.random.seed):
         seed(int(config["seed"]) % 2**32)
-    probe = build_env(config, material, worlds=1)
-    actor, critic = build_networks(config, material, probe)
+    probe = build_env(config, dataset, num_envs=1)
+    actor, critic = build_networks(config, dataset, probe)
     action_size = int(probe.action_spec.shape[-1])
     probe.close()
     sigma = _sigma_schedule(config, actor)
     with interrupts_held():
         collector = build_collector(
             collector_settings,
-            partial(_training_env, config, material, collector_settings, folder),
+            partial(_training_env, config, dataset, collector_settings, folder),
             collecting_policy(actor, critic),
             settings.steps_per_iteration,
         )
     if "discriminator" in algo:
-        ppo: PPO = _adversarial(config, material, actor, critic, ppo_settings)
+        ppo: PPO = _adversarial(config, dataset, actor, critic, ppo_settings)
     else:
         ppo = PPO(actor, critic, ppo_settings)
     settle_heap()
@@ -85,29 +85,29 @@ def _sigma_schedule(config: Mapping[str, Any], actor: TensorDictModuleBase) -> S
 
 def _adversarial(
     config: Mapping[str, Any],
-    material: Material,
+    dataset: Dataset,
     actor: TensorDictModuleBase,
     critic: TensorDictModuleBase,
     settings: PPOSettings,
 ) -> AdversarialPPO:
     """VGAIL's learner: the discriminator's examples are the reference's states on the training frames."""
-    if material.visual_context is None or config["model"]["context"]["source"] != "frozen":
+    if dataset.visual_context is None or config["model"]["context"]["source"] != "frozen":
         raise InputError("configuration", "model.context.source", "a discriminator needs frozen visual context")
-    offsets = material.takes.offsets
-    frames = torch.cat([torch.arange(f.start, f.stop) + offsets[f.take] for f in material.train])
-    states = humanoid_state(material.reference[frames]).float()
+    offsets = dataset.takes.offsets
+    frames = torch.cat([torch.arange(f.start, f.stop) + offsets[f.take] for f in dataset.train])
+    states = humanoid_state(dataset.reference[frames]).float()
     discriminator = DiscriminatorSettings.from_config(config["algo"]["discriminator"])
-    contexts, floor = torch.as_tensor(material.visual_context[frames]), float(config["regressor"]["std_floor"])
+    contexts, floor = torch.as_tensor(dataset.visual_context[frames]), float(config["regressor"]["std_floor"])
     return AdversarialPPO(actor, critic, settings, discriminator, states, contexts, floor)
 
 
 def _training_env(
-    config: Mapping[str, Any], material: Material, settings: CollectorSettings, folder: Path, worker: int
+    config: Mapping[str, Any], dataset: Dataset, settings: CollectorSettings, folder: Path, worker: int
 ) -> TransformedEnv:
     return build_env(
         config,
-        material,
-        worlds=settings.worlds,
+        dataset,
+        num_envs=settings.num_envs,
         threads=settings.physics_threads,
         seed=int(config["seed"]) * 1000 + worker,
         dump_dir=folder / "diverged",
@@ -116,7 +116,7 @@ def _training_env(
     )
 
 
-def build_evaluation(run: Run, material: Material) -> Evaluation:
+def build_evaluation(run: Run, dataset: Dataset) -> Evaluation:
     """A look at the mean action while training: frames survived on the test fragments, from starts that stay the same.
 
     Its ``score`` is the mean number of frames survived.
@@ -125,9 +125,9 @@ def build_evaluation(run: Run, material: Material) -> Evaluation:
     training = config["training"]
     env = build_env(
         config,
-        material,
+        dataset,
         "test",
-        worlds=int(training["evaluation_worlds"]),
+        num_envs=int(training["evaluation_num_envs"]),
         threads=int(config["collector"]["physics_threads"]),
     )
 

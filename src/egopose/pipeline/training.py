@@ -7,10 +7,10 @@ from typing import Any
 
 from egopose.checkpoint.resume import FINISHED, continued_job, finished, mark_finished, only_process, resumed_config
 from egopose.core.errors import InputError
-from egopose.pipeline.dataset import absolute_paths, load_material, run_material
-from egopose.pipeline.forecaster import with_futures
+from egopose.pipeline.dataset import absolute_paths, load_dataset, run_dataset
+from egopose.pipeline.forecaster import with_forecasts
 from egopose.pipeline.run import build_evaluation, build_run
-from egopose.tasks.dataset import Material
+from egopose.tasks.dataset import Dataset
 from egopose.training.logging import build_loggers, write_provenance
 from egopose.training.loop import TrainingStopped, train
 from egopose.training.ppo import TrainingDiverged
@@ -20,7 +20,7 @@ STOPPING = (TrainingDiverged, TrainingStopped, OSError)
 
 
 def run_training(
-    config: dict[str, Any], folder: Path, checkpoint: Path | None = None, material: Material | None = None
+    config: dict[str, Any], folder: Path, checkpoint: Path | None = None, dataset: Dataset | None = None
 ) -> float:
     """Train in ``folder`` and say where things are.
 
@@ -28,7 +28,7 @@ def run_training(
         config: resolved.
         folder: the run directory.
         checkpoint: to go on from, None for a new run.
-        material: to train on; None for what ``config`` names.
+        dataset: to train on; None for what ``config`` names.
 
     Returns:
         The score of the last evaluation (or the mean episode length in training).
@@ -43,16 +43,16 @@ def run_training(
         write_provenance(folder, config)
         (folder / FINISHED).unlink(missing_ok=True)
         print(f"run directory: {folder}", flush=True)
-        if material is None:
-            material = load_material(config) if checkpoint is None else run_material(config, folder)
-        material = with_futures(config, material, folder)
-        run = build_run(config, folder, material)
+        if dataset is None:
+            dataset = load_dataset(config) if checkpoint is None else run_dataset(config, folder)
+        dataset = with_forecasts(config, dataset, folder)
+        run = build_run(config, folder, dataset)
         try:
             if checkpoint is not None:
                 run.restore(checkpoint)
                 print(f"resuming {folder} after iteration {run.counters.iteration}", flush=True)
             loggers = build_loggers(config["logger"], folder, config, run.counters.iteration, run.counters.frames)
-            outcome = train(run, loggers, build_evaluation(run, material))
+            outcome = train(run, loggers, build_evaluation(run, dataset))
         finally:
             run.collector.shutdown()
     except KeyboardInterrupt:
@@ -67,7 +67,7 @@ def run_training(
     return run.counters.score
 
 
-def run_job(config: dict[str, Any], folder: Path, material: Material | None = None) -> float:
+def run_job(config: dict[str, Any], folder: Path, dataset: Dataset | None = None) -> float:
     """:func:`run_training` in the directory of one job of a sweep, as far as that is still to be done.
 
     A job that came to its end is not run again; one that was cut off goes on from its last checkpoint.
@@ -79,7 +79,7 @@ def run_job(config: dict[str, Any], folder: Path, material: Material | None = No
     if (done := finished(folder, config)) is not None:
         print(f"{folder}: {done['reason']} already after {done['iteration']} iterations", flush=True)
         return float(done["score"])
-    return run_training(config, folder, checkpoint, material)
+    return run_training(config, folder, checkpoint, dataset)
 
 
 def start_run(config: dict[str, Any], folder: Path, multirun: bool, overrides: list[str]) -> float:

@@ -20,7 +20,7 @@ from egopose.core.safe_io import read_json
 from egopose.data.fragments import FragmentLike
 from egopose.data.store import TakeInfo
 from egopose.envs.problem import TakeTable
-from egopose.envs.reference_forecasts import Futures
+from egopose.envs.reference_forecasts import ReferenceForecasts
 from egopose.humanoid.model import HumanoidModel
 
 PROVENANCE = "provenance.json"
@@ -29,7 +29,7 @@ _LOOKAHEAD = 10
 
 
 @dataclass(frozen=True)
-class Material:
+class Dataset:
     """Humanoid, reference, fragments and the state regressor's tables.
 
     Args:
@@ -43,7 +43,7 @@ class Material:
         states: ``[F, S]`` humanoid states of the state regressor, or None.
         regressor: folder of the state regressor's weights, or None.
         store_fingerprint: of the store it all comes from, or None.
-        futures: kinematic forecasts a policy follows, or None.
+        forecasts: kinematic forecasts a policy follows, or None.
     """
 
     humanoid: HumanoidModel
@@ -57,7 +57,7 @@ class Material:
     states: Tensor | None = None
     regressor: Path | None = None
     store_fingerprint: str | None = None
-    futures: Futures | None = None
+    forecasts: ReferenceForecasts | None = None
 
     def keep_regressor(self, folder: Path) -> None:
         """Copy the state regressor's weights to ``folder/regressor``, so that a run can be used without its store."""
@@ -113,21 +113,21 @@ def take_table(takes: Sequence[TakeInfo]) -> TakeTable:
     )
 
 
-def smoothed(material: Material, deviation: float) -> Material:
-    """The material with what the regressor saw smoothed in time, take by take.
+def smoothed(dataset: Dataset, deviation: float) -> Dataset:
+    """The dataset with what the regressor saw smoothed in time, take by take.
 
     The regressor judges each frame nearly by itself: its joints jitter at 14 rad/s^2 where people's move at 3. States
     are smoothed number by number (a quaternion so near its neighbours may be), joint targets and context likewise.
 
     Args:
-        material: with tables of a regressor.
+        dataset: with tables of a regressor.
         deviation: s, of a Gaussian cut at a third of a second, which is what the causal form may look ahead; 0 for
-            the material as it is.
+            the dataset as it is.
     """
     if deviation <= 0:
-        return material
-    frames = deviation / material.humanoid.control_dt
-    spans = list(zip(material.takes.offsets.tolist(), material.takes.lengths.tolist(), strict=True))
+        return dataset
+    frames = deviation / dataset.humanoid.control_dt
+    spans = list(zip(dataset.takes.offsets.tolist(), dataset.takes.lengths.tolist(), strict=True))
 
     def smooth(table: Tensor | None) -> Tensor | None:
         if table is None:
@@ -140,8 +140,8 @@ def smoothed(material: Material, deviation: float) -> Material:
         return out
 
     return replace(
-        material,
-        states=smooth(material.states),
-        joint_targets=smooth(material.joint_targets),
-        visual_context=smooth(material.visual_context),
+        dataset,
+        states=smooth(dataset.states),
+        joint_targets=smooth(dataset.joint_targets),
+        visual_context=smooth(dataset.visual_context),
     )

@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from egopose.checkpoint.body_parts import load_finder
+from egopose.checkpoint.body_parts import load_body_part_estimator
 from egopose.core.errors import InputError
 from egopose.core.torch_settings import torch_threads
 from egopose.data.spans import Span, without_block
@@ -77,7 +77,7 @@ class KernelSettings:
     @property
     def limb_numbers(self) -> int:
         """Numbers of a frame that come from the limb finder."""
-        return 0 if self.limbs is None else 2 * load_finder(self.limbs).numbers
+        return 0 if self.limbs is None else 2 * load_body_part_estimator(self.limbs).numbers
 
     def windows(self) -> TimeWindows:
         return TimeWindows(self.reach, self.step, self.width, self.also)
@@ -217,7 +217,7 @@ def mirrored_view(view: Tensor, settings: KernelSettings) -> Tensor:
     flow, limbs = view.split([FLOW_CHANNELS * settings.cells**2, settings.limb_numbers], dim=1)
     parts = [StateMirror.flow(flow.unflatten(1, (FLOW_CHANNELS, settings.cells, settings.cells))).flatten(1)]
     if settings.limbs is not None:
-        parts.append(load_finder(settings.limbs).mirrored_rows(limbs))
+        parts.append(load_body_part_estimator(settings.limbs).mirrored_rows(limbs))
     return torch.cat(parts, dim=1)
 
 

@@ -1,4 +1,4 @@
-"""Training of :class:`egopose.vision.body_parts.LimbFinder` on drawn pictures: loss, loop, held-out figures, what is kept.
+"""Training of the body-part estimator on drawn pictures: loss, loop, held-out figures, what is kept.
 
 Masks by binary cross-entropy, postures by the likelihood of a normal distribution whose variance is learned with it.
 """
@@ -24,7 +24,7 @@ from egopose.core.torch_settings import torch_threads
 from egopose.models.mirror import StateMirror, joint_mirror
 from egopose.motion.skeleton import Skeleton
 from egopose.vision.body_part_pictures import BODIES, posture_names
-from egopose.vision.body_parts import LIMBS, LimbFinder
+from egopose.vision.body_parts import LIMBS, BodyPartEstimator
 from egopose.vision.flow import FlowConfig
 
 State = dict[str, Tensor]
@@ -33,7 +33,7 @@ _LIMB_MIRROR = [1, 0, 3, 2, 4]
 
 
 @dataclass(frozen=True)
-class FinderSettings:
+class BodyPartSettings:
     """The group ``training`` of ``conf/limbs.yaml``.
 
     Args:
@@ -70,7 +70,7 @@ class FinderSettings:
     threads: int
 
     @classmethod
-    def from_config(cls, values: Mapping[str, Any]) -> FinderSettings:
+    def from_config(cls, values: Mapping[str, Any]) -> BodyPartSettings:
         """Raises InputError: a key is missing, unknown or out of range; names it."""
         source = "conf/limbs.yaml: training"
         settings = from_mapping(cls, values, source)
@@ -135,7 +135,7 @@ def mirrored(sample: Pictures, mirror: StateMirror) -> Pictures:
     )
 
 
-def varied(sample: Pictures, mirror: StateMirror, settings: FinderSettings, generator: torch.Generator) -> Pictures:
+def varied(sample: Pictures, mirror: StateMirror, settings: BodyPartSettings, generator: torch.Generator) -> Pictures:
     """What else the sample could have been: half of it mirrored, the colours of all changed about, each one's contrast
     and brightness another. The pictures come back as float32.
     """
@@ -157,7 +157,7 @@ def varied(sample: Pictures, mirror: StateMirror, settings: FinderSettings, gene
     )
 
 
-def finder_loss(model: LimbFinder, sample: Pictures, mask_weight: float, bfloat16: bool) -> Tensor:
+def body_part_loss(model: BodyPartEstimator, sample: Pictures, mask_weight: float, bfloat16: bool) -> Tensor:
     """Cross-entropy of the masks times its weight, and the posture's negative log likelihood a number."""
     with torch.autocast("cpu", torch.bfloat16, enabled=bfloat16):
         masks, posture, log_variance = model(sample.pictures[:, :3], sample.pictures[:, 3:], sample.flow)
@@ -168,17 +168,17 @@ def finder_loss(model: LimbFinder, sample: Pictures, mask_weight: float, bfloat1
     return mask_weight * functional.binary_cross_entropy_with_logits(masks.float(), shares) + likelihood
 
 
-class FinderTraining:
+class BodyPartTraining:
     """A training under way: the model, its optimiser and the number of steps, as flat tensors to go on from.
 
     Args:
         data: the pictures trained on, without those held out.
         skeleton: of the postures.
-        settings: see :class:`FinderSettings`.
+        settings: see :class:`BodyPartSettings`.
         seed: of the first weights and of every draw.
     """
 
-    def __init__(self, data: Pictures, skeleton: Skeleton, settings: FinderSettings, seed: int) -> None:
+    def __init__(self, data: Pictures, skeleton: Skeleton, settings: BodyPartSettings, seed: int) -> None:
         if len(data) < settings.batch:
             cause = f"is {settings.batch}, and there are {len(data)} pictures to train on"
             raise InputError("conf/limbs.yaml: training", "batch", cause)
@@ -186,7 +186,7 @@ class FinderTraining:
         self.mirror = posture_mirror(skeleton)
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
-            self.model = LimbFinder(data.posture.shape[1], settings.channels)
+            self.model = BodyPartEstimator(data.posture.shape[1], settings.channels)
         self.model.mean.copy_(data.posture.mean(0))
         self.model.std.copy_(data.posture.std(0).clamp(min=settings.least_deviation))
         self.optimiser = torch.optim.AdamW(
@@ -209,7 +209,7 @@ class FinderTraining:
         generator = torch.Generator().manual_seed(self.seed * 1_000_003 + self.steps)
         self.model.train()
         sample = varied(self.data.rows(self._batch()), self.mirror, settings, generator)
-        loss = finder_loss(self.model, sample, settings.mask_weight, settings.bfloat16)
+        loss = body_part_loss(self.model, sample, settings.mask_weight, settings.bfloat16)
         self.optimiser.zero_grad(set_to_none=True)
         loss.backward()
         norm = nn.utils.clip_grad_norm_(self.model.parameters(), settings.gradient_clip)
@@ -254,20 +254,20 @@ class FinderTraining:
         return self._order[1][at * size : (at + 1) * size]
 
 
-def train_finder(
+def train_body_part_estimator(
     data: Pictures,
     skeleton: Skeleton,
-    settings: FinderSettings,
+    settings: BodyPartSettings,
     seed: int,
     folder: Path | None = None,
     told: Callable[[int, int, float], None] | None = None,
-) -> LimbFinder:
+) -> BodyPartEstimator:
     """Train a finder; interrupted, it goes on from what it saved.
 
     Args:
         data: the pictures, without those held out.
         skeleton: of the postures.
-        settings: see :class:`FinderSettings`.
+        settings: see :class:`BodyPartSettings`.
         seed: of the first weights and of every draw.
         folder: where the state is saved to go on from; None: nowhere.
         told: called after each save with steps, of how many, and the mean loss since the last time.
@@ -279,7 +279,7 @@ def train_finder(
         InputError: there are too few pictures; ``folder`` is damaged or of another training.
     """
     with torch_threads(settings.threads):
-        work = FinderTraining(data, skeleton, settings, seed)
+        work = BodyPartTraining(data, skeleton, settings, seed)
         if folder is not None and folder.is_dir():
             if read_json(folder, "terms") != work.terms():
                 raise InputError(folder, "settings", "are another training's: remove it or name another folder")
@@ -303,7 +303,9 @@ def train_finder(
 
 
 @torch.no_grad()
-def held_out_figures(model: LimbFinder, data: Pictures, skeleton: Skeleton, batch: int) -> dict[str, dict[str, float]]:
+def held_out_figures(
+    model: BodyPartEstimator, data: Pictures, skeleton: Skeleton, batch: int
+) -> dict[str, dict[str, float]]:
     """Share of the variance that is explained (R2), on pictures that were not trained on.
 
     Returns:
@@ -311,14 +313,14 @@ def held_out_figures(model: LimbFinder, data: Pictures, skeleton: Skeleton, batc
         ``joints``: by joint, a mean over its angles. A number that does not vary counts as not explained.
     """
     model.eval()
-    covered, found = [], []
+    covered, result = [], []
     for rows in torch.arange(len(data)).split(batch):
         part = data.rows(rows)
         masks, posture, _ = model(part.pictures[:, :3], part.pictures[:, 3:], part.flow)
         covered.append(torch.sigmoid(masks))
-        found.append(posture * model.std + model.mean)
+        result.append(posture * model.std + model.mean)
     by_mask = _explained(torch.cat(covered), data.masks.float() / 255.0, (0, 2, 3))
-    by_number = _explained(torch.cat(found), data.posture, (0,)).tolist()
+    by_number = _explained(torch.cat(result), data.posture, (0,)).tolist()
     groups: dict[str, dict[str, list[float]]] = {"posture": {}, "joints": {}}
     here = 3 * len(BODIES) + 4
     for at, (name, value) in enumerate(zip(posture_names(skeleton), by_number, strict=True)):
@@ -338,8 +340,13 @@ def _explained(found: Tensor, truth: Tensor, over: Sequence[int]) -> Tensor:
     return torch.where(spread > 0, 1.0 - rest / spread.clamp(min=1e-12), torch.zeros_like(rest))
 
 
-def save_finder(
-    folder: str | Path, model: LimbFinder, skeleton: Skeleton, flow: FlowConfig, card: Mapping[str, Any], steps: int
+def save_body_part_estimator(
+    folder: str | Path,
+    model: BodyPartEstimator,
+    skeleton: Skeleton,
+    flow: FlowConfig,
+    card: Mapping[str, Any],
+    steps: int,
 ) -> Path:
     """Keep a finder as a checkpoint folder: components ``finder``, ``config`` and ``card``.
 

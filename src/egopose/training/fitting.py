@@ -120,8 +120,8 @@ class Fit:
         """
         for label in ("model", "best"):
             for key, value in _weights(self.learner.model).items():
-                found = state.get(f"{label}/{key}")
-                if found is None or found.shape != value.shape:
+                result = state.get(f"{label}/{key}")
+                if result is None or result.shape != value.shape:
                     raise InputError("baseline state", f"{label}/{key}", "is missing or of another shape")
         self.learner.model.load_state_dict(_under(state, "model"))
         self.best = {key: value.clone() for key, value in _under(state, "best").items()}

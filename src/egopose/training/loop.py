@@ -161,8 +161,8 @@ class Run:
         state.scored = False
         components = self.checkpoint()
         for name in ("policy", "critic", "policy_optimizer", "value_optimizer", "transforms"):
-            if (found := _not_finite(components.components[name].state_dict(), name)) is not None:
-                raise TrainingDiverged(f"{found} is not finite")
+            if (result := _not_finite(components.components[name].state_dict(), name)) is not None:
+                raise TrainingDiverged(f"{result} is not finite")
         metadata = checkpoints.metadata_of(self.task, self.action_size, state.iteration, state.frames, score)
         kept = checkpoints.rotation(self.folder, self.settings.keep_last)
         self._saved = state.frames, kept.save(components, step=state.frames, metadata=metadata)
@@ -266,8 +266,8 @@ def _not_finite(state: Any, name: str) -> str | None:
         return None if torch.isfinite(state).all() else name
     if isinstance(state, Mapping):
         for key, value in state.items():
-            if (found := _not_finite(value, f"{name}.{key}")) is not None:
-                return found
+            if (result := _not_finite(value, f"{name}.{key}")) is not None:
+                return result
     return None
 
 
@@ -312,7 +312,7 @@ def iterate(run: Run, batches: Iterator[TensorDictBase]) -> dict[str, float]:
     counters.iteration += 1
     counters.frames += batch.numel()
     counters.skipped_minibatches += int(learning["skipped_minibatches"])
-    experience = experience_figures(batch)
+    experience = batch_metrics(batch)
     counters.diverged_worlds += int(experience.get("diverged", 0))
     return {
         "iteration": float(counters.iteration),
@@ -325,7 +325,7 @@ def iterate(run: Run, batches: Iterator[TensorDictBase]) -> dict[str, float]:
     }
 
 
-def experience_figures(batch: TensorDictBase) -> dict[str, float]:
+def batch_metrics(batch: TensorDictBase) -> dict[str, float]:
     """Figures of a batch ``[N, T]``.
 
     ``reward`` and each of ``reward_terms``: mean a step. Of the episodes that ended in the batch: ``episode_length``

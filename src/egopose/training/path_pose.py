@@ -129,8 +129,8 @@ class PathPoseLearner:
     def _path_error(self, weight: float) -> float:
         total, frames = 0.0, 0
         for seen, wanted in self.kept:
-            found = self.model.centres[torch.as_tensor(self.model.path(seen, weight))]
-            total += float((_angles_of(found) - _angles_of(wanted)).norm(dim=1).sum())
+            result = self.model.centres[torch.as_tensor(self.model.path(seen, weight))]
+            total += float((_angles_of(result) - _angles_of(wanted)).norm(dim=1).sum())
             frames += len(wanted)
         return total / frames
 

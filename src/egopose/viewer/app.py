@@ -134,13 +134,13 @@ class Viewer:
 
     def _clips(self) -> list[tuple[str, Clip, Color]]:
         """The run shown and the one it is compared with, where both have the take."""
-        found: list[tuple[str, Clip, Color]] = []
+        result: list[tuple[str, Clip, Color]] = []
         for label, color in ((self._run.value, _MAIN), (self._compare.value, _OTHER)):
             run = self._runs.get(label)
             clip = None if run is None else run.clips.get(self._take.value)
-            if clip is not None and label not in [name for name, _, _ in found]:
-                found.append((label, clip, color))
-        return found
+            if clip is not None and label not in [name for name, _, _ in result]:
+                result.append((label, clip, color))
+        return result
 
     def _choose_run(self) -> None:
         takes = list(self._runs[self._run.value].clips)

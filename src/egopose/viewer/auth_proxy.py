@@ -83,7 +83,7 @@ def _answer(status: str, *headers: str) -> bytes:
     return "\r\n".join([f"HTTP/1.1 {status}", *headers, *fixed, "", body]).encode()
 
 
-class Door:
+class AuthProxy:
     """Listens at ``address`` and leads to the port ``behind`` of this machine, on a thread of its own.
 
     Raises:

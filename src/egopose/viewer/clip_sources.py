@@ -66,8 +66,8 @@ def read_runs(paths: Sequence[str | Path], footage: Footage | None = None) -> li
 
 
 def _read_evaluation(folder: Path, prefix: str) -> dict[str, Clip]:
-    found = [*sorted((folder / "takes").glob("*")), *sorted((folder / "windows").glob("*"))]
-    whole = [f for f in found if (f / "estimate.npz").is_file() or (f / "forecast.npz").is_file()]
+    result = [*sorted((folder / "takes").glob("*")), *sorted((folder / "windows").glob("*"))]
+    whole = [f for f in result if (f / "estimate.npz").is_file() or (f / "forecast.npz").is_file()]
     return {f"{prefix}{f.name}": _read_folder(f) for f in whole}
 
 
@@ -100,12 +100,12 @@ def _read_footage(folder: Path) -> Footage | None:
     """
     record, panels = folder / FOOTAGE, folder / "side_by_side.mp4"
     if record.is_file():
-        found = read_json(record, "footage")
+        result = read_json(record, "footage")
         try:
-            path, rate = Path(str(found["video"])), found["taken_at"]
-            offset, start = float(found["sync_offset"]), float(found["start"])
+            path, rate = Path(str(result["video"])), result["taken_at"]
+            offset, start = float(result["sync_offset"]), float(result["start"])
             rate = None if rate is None else float(rate)
-            footage = Footage(path, offset, start, rendered=bool(found["rendered"]), taken_at=rate)
+            footage = Footage(path, offset, start, rendered=bool(result["rendered"]), taken_at=rate)
         except (KeyError, TypeError, ValueError) as error:
             raise InputError(record, "footage", f"is damaged: {error!r}") from None
         if path.is_file():

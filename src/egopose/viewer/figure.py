@@ -24,7 +24,7 @@ class Figure:
     """One motion in the scene; ``name`` is its place in the scene's tree.
 
     Args:
-        opacity: below 1 for ghosts. marks: contacts, torques and forces are shown where the motion holds them.
+        opacity: below 1 for overlays. marks: contacts, torques and forces are shown where the motion holds them.
     """
 
     def __init__(
@@ -134,5 +134,5 @@ class _Forces:
 
 def _joint_of(label: str, names: tuple[str, ...]) -> int | None:
     """The joint whose name a contact's label begins with; the longest such name."""
-    found = [n for n in names if label.lower().startswith(n.lower())]
-    return names.index(max(found, key=len)) if found else None
+    result = [n for n in names if label.lower().startswith(n.lower())]
+    return names.index(max(result, key=len)) if result else None

@@ -9,7 +9,7 @@ import numpy as np
 import viser
 
 from egopose.motion.rotations import Array
-from egopose.viewer.auth_proxy import Address, Door
+from egopose.viewer.auth_proxy import Address, AuthProxy
 
 
 class Server(viser.ViserServer):
@@ -19,7 +19,7 @@ class Server(viser.ViserServer):
         return None
 
 
-def open_server(address: Address) -> tuple[Server, Door, str]:
+def open_server(address: Address) -> tuple[Server, AuthProxy, str]:
     """The server, the door before it and what to open in a browser.
 
     Raises:
@@ -28,7 +28,7 @@ def open_server(address: Address) -> tuple[Server, Door, str]:
     with redirect_stdout(io.StringIO()):  # its banner names an address that is not the door's
         server = Server("127.0.0.1", 0, label="egopose", verbose=False)
     try:
-        door = Door(address, server.get_port())
+        door = AuthProxy(address, server.get_port())
     except Exception:
         server.stop()
         raise

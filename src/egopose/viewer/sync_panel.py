@@ -116,13 +116,13 @@ class SyncPanel:
             return
         self._turning = head, camera
         try:
-            found: Sync = find_offset(head, camera, self._settings, "sync")
+            result: Sync = find_offset(head, camera, self._settings, "sync")
         except InputError as error:
             self._tell(f"{error}")
             return
         assert clip.footage is not None
-        self._set(found.offset - clip.footage.start)
-        self._tell(f"found: correlation {found.correlation:.2f}, confidence {found.confidence:.2f}")
+        self._set(result.offset - clip.footage.start)
+        self._tell(f"found: correlation {result.correlation:.2f}, confidence {result.confidence:.2f}")
 
     def _nudge(self, frames: int) -> None:
         if (footage := self._footage) is not None:

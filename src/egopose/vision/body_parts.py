@@ -46,7 +46,7 @@ class _Residual(nn.Module):
         return x + self.b(torch.relu(self.m(self.a(torch.relu(self.n(x))))))
 
 
-class LimbFinder(nn.Module):
+class BodyPartEstimator(nn.Module):
     """Pictures and flow -> masks of the limbs, and the posture they show with how sure that is.
 
     Args:
@@ -105,7 +105,7 @@ class LimbFinder(nn.Module):
         return functional.pixel_shuffle(self.mask(features), 2), posture, log_variance.clamp(*LOG_VARIANCE)
 
     def mirrored_rows(self, rows: Tensor) -> Tensor:
-        """Rows ``[..., 2 Q]`` (:func:`limb_rows`) of a scene as rows of its mirror image, float32."""
+        """Rows ``[..., 2 Q]`` (:func:`body_part_rows`) of a scene as rows of its mirror image, float32."""
         posture, log_variance = rows.to(torch.float32).chunk(2, -1)
         posture = self.mirror_sign * (posture * self.std + self.mean)[..., self.mirror_index]
         # A variance is in squares of its number's own deviation.
@@ -120,7 +120,9 @@ def small_picture(frame: Frame) -> Picture:
 
 
 @torch.no_grad()
-def limb_rows(finder: LimbFinder, pictures: Sequence[Picture] | NDArray[np.uint8], flow: NDArray) -> NDArray:
+def body_part_rows(
+    finder: BodyPartEstimator, pictures: Sequence[Picture] | NDArray[np.uint8], flow: NDArray
+) -> NDArray:
     """What a finder makes of a clip: posture and logarithms of its variances, ``[T, 2 Q]`` float16.
 
     Args:
@@ -140,8 +142,8 @@ def limb_rows(finder: LimbFinder, pictures: Sequence[Picture] | NDArray[np.uint8
 
 
 @torch.no_grad()
-def pair_rows(finder: LimbFinder, before: Tensor, now: Tensor, flow: Tensor) -> NDArray:
-    """As :func:`limb_rows` of pairs of pictures ``[B, 3, 64, 64]`` and the flow between them ``[B, 2, S, S]``."""
+def pair_rows(finder: BodyPartEstimator, before: Tensor, now: Tensor, flow: Tensor) -> NDArray:
+    """As :func:`body_part_rows` of pairs of pictures ``[B, 3, 64, 64]`` and the flow between them ``[B, 2, S, S]``."""
     if flow.shape[-1] != FLOW:
         flow = functional.interpolate(flow.float(), (FLOW, FLOW), mode="bilinear", antialias=True)
     _, posture, log_variance = finder(before, now, flow)

@@ -11,7 +11,7 @@ from egopose.motion.rotations import Array
 _ROUNDS = 5
 
 
-def camera_turning(flow: NDArray[np.floating], field_of_view: float) -> Array:
+def camera_rotation(flow: NDArray[np.floating], field_of_view: float) -> Array:
     """The camera's turn in each frame, in its own axes: x right, y down, z ahead.
 
     A turn w of a pinhole moves the point (x, y) at unit distance by u = x y wx - (1 + x^2) wy + y wz and

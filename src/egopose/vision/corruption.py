@@ -49,13 +49,13 @@ class Corruption:
         """
         if config.get("corruption") is None:
             return None
-        found = from_mapping(cls, config["corruption"], _SOURCE)
+        result = from_mapping(cls, config["corruption"], _SOURCE)
         for name in ("jitter", "drift", "shake", "shake_rate"):
-            if not 0.0 <= getattr(found, name) < float("inf"):
-                raise InputError(_SOURCE, name, f"must be 0 or more, not {getattr(found, name)}")
-        if not 0.0 <= found.dropped < 1.0:
-            raise InputError(_SOURCE, "dropped", f"must be a share under 1, not {found.dropped}")
-        return found if found.jitter or found.drift or found.shake or found.dropped else None
+            if not 0.0 <= getattr(result, name) < float("inf"):
+                raise InputError(_SOURCE, name, f"must be 0 or more, not {getattr(result, name)}")
+        if not 0.0 <= result.dropped < 1.0:
+            raise InputError(_SOURCE, "dropped", f"must be a share under 1, not {result.dropped}")
+        return result if result.jitter or result.drift or result.shake or result.dropped else None
 
     def generator(self, take_seed: int) -> np.random.Generator:
         """A take's own; nothing else is drawn from it, so that a take's room and camera stay as they are without."""

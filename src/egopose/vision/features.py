@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from egopose.vision.body_parts import LimbFinder, Picture, as_plane, limb_rows, small_picture
+from egopose.vision.body_parts import BodyPartEstimator, Picture, as_plane, body_part_rows, small_picture
 from egopose.vision.encoders import FlowEncoder
 from egopose.vision.flow import FlowConfig, flow_of_frames
 from egopose.vision.lens import Camera, undo_rolling_shutter
@@ -25,7 +25,7 @@ def extract_flow(
     offset: float = 0.0,
     count: int | None = None,
     camera: Camera | None = None,
-    finder: LimbFinder | None = None,
+    finder: BodyPartEstimator | None = None,
 ) -> NDArray[np.float16]:
     """Flow of a video in step with a motion, and what a limb finder makes of its pictures.
 
@@ -55,24 +55,24 @@ def extract_flow(
         flow = undo_rolling_shutter(flow, camera.readout, 1.0 / fps)
     if finder is None:
         return flow
-    return np.concatenate([flow, as_plane(limb_rows(finder, pictures, flow), config.stored_size)], axis=1)
+    return np.concatenate([flow, as_plane(body_part_rows(finder, pictures, flow), config.stored_size)], axis=1)
 
 
-def extract_limbs(
+def extract_body_parts(
     path: str | PathLike[str],
     flow: NDArray[np.floating],
     cfg: FlowConfig,
-    finder: LimbFinder,
+    finder: BodyPartEstimator,
     fps: float,
     offset: float,
     camera: Camera | None,
 ) -> NDArray[np.float16]:
-    """``[T, 2 Q]``, see :func:`egopose.vision.body_parts.limb_rows`, of a video whose flow ``[T, 2, S, S]`` is there.
+    """``[T, 2 Q]`` of a video whose flow ``[T, 2, S, S]`` is there, see :func:`~egopose.vision.body_parts.body_part_rows`.
 
     Other arguments, and errors, as of :func:`extract_flow`.
     """
     pictures = [small_picture(frame) for frame in _frames(path, cfg, fps, offset, len(flow), camera)]
-    return limb_rows(finder, pictures, flow)
+    return body_part_rows(finder, pictures, flow)
 
 
 def _frames(

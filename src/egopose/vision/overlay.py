@@ -15,18 +15,18 @@ from egopose.vision.video import Frame
 Colour = tuple[float, float, float, float]
 
 
-class GhostRenderer(SceneRenderer):
-    """Renders a body with up to ``ghosts`` coloured copies of it in other poses; see :class:`SceneRenderer`."""
+class OverlayRenderer(SceneRenderer):
+    """Renders a body with up to ``overlays`` coloured copies of it in other poses; see :class:`SceneRenderer`."""
 
-    def __init__(self, model: mujoco.MjModel, width: int, height: int, ghosts: int) -> None:
+    def __init__(self, model: mujoco.MjModel, width: int, height: int, overlays: int) -> None:
         super().__init__(model, width, height)
-        self._scene = mujoco.MjvScene(self.model, maxgeom=(ghosts + 1) * self.model.ngeom + 200)
+        self._scene = mujoco.MjvScene(self.model, maxgeom=(overlays + 1) * self.model.ngeom + 200)
         self._scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = 0
         self._scene.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = 0
         self._ghost = mujoco.MjData(self.model)
 
-    def render_with(self, qpos: Array, ghosts: Sequence[tuple[Array, Colour]], camera: mujoco.MjvCamera) -> Frame:
-        """The picture ``[height, width, 3]`` of ``qpos [nq]`` and the ghosts' poses in their colours (rgba)."""
+    def render_with(self, qpos: Array, overlays: Sequence[tuple[Array, Colour]], camera: mujoco.MjvCamera) -> Frame:
+        """The picture ``[height, width, 3]`` of ``qpos [nq]`` and the overlays' poses in their colours (rgba)."""
         if self._gl is None:
             raise ValueError("the renderer is closed")
         self._pose(self.data, qpos)
@@ -34,7 +34,7 @@ class GhostRenderer(SceneRenderer):
         self._gl.make_current()
         options, every = self._options, mujoco.mjtCatBit.mjCAT_ALL
         mujoco.mjv_updateScene(self.model, self.data, options, None, camera, every, self._scene)
-        for pose, colour in ghosts:
+        for pose, colour in overlays:
             self._pose(self._ghost, pose)
             first = self._scene.ngeom
             moving = mujoco.mjtCatBit.mjCAT_DYNAMIC
@@ -52,10 +52,10 @@ class GhostRenderer(SceneRenderer):
         mujoco.mj_comPos(self.model, data)
 
 
-def ghost_frames(
+def overlay_frames(
     model: mujoco.MjModel,
     solid: Array,
-    ghosts: Sequence[tuple[Array, Colour]],
+    overlays: Sequence[tuple[Array, Colour]],
     label: str,
     size: int,
     azimuth: float = 120.0,
@@ -65,7 +65,7 @@ def ghost_frames(
     Args:
         model: the humanoid with its floor.
         solid: ``[T, nq]``.
-        ghosts: motions ``[T, nq]``, each with its colour (rgba).
+        overlays: motions ``[T, nq]``, each with its colour (rgba).
         label: written into the picture.
         size: side of the picture, pixels.
         azimuth: from where the camera looks, degrees about z.
@@ -76,8 +76,8 @@ def ghost_frames(
     view = mujoco.MjvCamera()
     view.type = mujoco.mjtCamera.mjCAMERA_FREE
     view.distance, view.elevation, view.azimuth = 3.6, -12.0, azimuth
-    with closing(GhostRenderer(model, size, size, len(ghosts))) as renderer:
+    with closing(OverlayRenderer(model, size, size, len(overlays))) as renderer:
         for t, pose in enumerate(solid):
             view.lookat = [pose[0], pose[1], 0.85]
-            around = [(motion[t], colour) for motion, colour in ghosts]
+            around = [(motion[t], colour) for motion, colour in overlays]
             yield label_frame(renderer.render_with(pose, around, view), label)

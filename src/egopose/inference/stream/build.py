@@ -27,20 +27,20 @@ from egopose.inference.causal import CausalRegression
 from egopose.inference.failsafe import FailSafeSettings
 from egopose.inference.stream import live_forecasts, loop
 from egopose.inference.stream.forecasting import ForecastThread
-from egopose.inference.stream.frame_features import Sight
+from egopose.inference.stream.frame_features import FrameFeatures
 from egopose.inference.stream.frame_sources import ReconnectSettings, SourceSettings, check_source
 from egopose.inference.stream.latency import LatencyTable
 from egopose.inference.stream.live_body import LiveBody
 from egopose.inference.stream.live_forecasts import ForecastSettings, LiveFutures, Moment
 from egopose.inference.stream.loop import LiveLoop, LoopSettings
 from egopose.inference.stream.outputs import check_outputs, open_outputs
-from egopose.inference.video_regression import causal_regression, run_folder, seen_in, video_material
+from egopose.inference.video_regression import causal_regression, run_folder, seen_in, video_dataset
 from egopose.models.regressor import StateRegressor
 from egopose.pipeline.agent import load_agent
-from egopose.pipeline.forecaster import ForecastCurves, still_futures
+from egopose.pipeline.forecaster import ForecastCurves, still_forecasts
 from egopose.pipeline.regressor import load_regressor
-from egopose.pipeline.regressor_input import finder_of, load_finder_of, planes_of
-from egopose.tasks.dataset import Material
+from egopose.pipeline.regressor_input import body_part_estimator_name, load_body_part_estimator_of, planes_of
+from egopose.tasks.dataset import Dataset
 from egopose.vision.flow import FlowConfig
 from egopose.vision.lens import Camera
 
@@ -54,7 +54,7 @@ class Trained:
     Args:
         humanoid: the run's.
         regressor: in eval mode.
-        made_with: the groups ``vision`` and ``regressor``.
+        source_config: the groups ``vision`` and ``regressor``.
         env: one world, on a take of two frames.
         actor, critic: in eval mode.
         config: of the run, resolved.
@@ -62,7 +62,7 @@ class Trained:
 
     humanoid: HumanoidModel
     regressor: StateRegressor
-    made_with: Mapping[str, Any]
+    source_config: Mapping[str, Any]
     env: TransformedEnv
     actor: TensorDictModuleBase
     critic: TensorDictModuleBase
@@ -78,10 +78,10 @@ def load_trained(checkpoint: str, which: str) -> Trained:
     folder = find_checkpoint(checkpoint, which)
     config = read_json(folder, "config")
     humanoid = humanoid_of(config)
-    regressor, made_with = load_regressor(run_folder(folder) / "regressor")
-    agent = load_agent(folder, still_frames(humanoid, regressor, made_with))
-    env = agent.make_env("test", worlds=1, threads=1, whole_fragments=True, falls_end=False)
-    return Trained(humanoid, regressor, made_with, env, agent.actor, agent.critic, config)
+    regressor, source_config = load_regressor(run_folder(folder) / "regressor")
+    agent = load_agent(folder, still_frames(humanoid, regressor, source_config))
+    env = agent.make_env("test", num_envs=1, threads=1, whole_fragments=True, falls_end=False)
+    return Trained(humanoid, regressor, source_config, env, agent.actor, agent.critic, config)
 
 
 @dataclass(frozen=True)
@@ -135,32 +135,34 @@ def load_forecaster(values: Mapping[str, Any], trained: Trained) -> Forecaster |
     humanoid = humanoid_of(config)
     if humanoid.skeleton != trained.humanoid.skeleton or humanoid.control_dt != trained.humanoid.control_dt:
         raise InputError(folder, "humanoid", "another body than the estimating run's: train both with one humanoid")
-    regressor, made_with = load_regressor(run_folder(folder) / "regressor")
-    flows = ({**dict(made["vision"]["flow"]), "workers": 1} for made in (made_with, trained.made_with))
+    regressor, source_config = load_regressor(run_folder(folder) / "regressor")
+    flows = ({**dict(made["vision"]["flow"]), "workers": 1} for made in (source_config, trained.source_config))
     if len({tuple(sorted(flow.items())) for flow in flows}) > 1:
         raise InputError(folder, "vision.flow", "another flow than the estimating run's: train both with one vision")
-    if finder_of(made_with["regressor"]) != finder_of(trained.made_with["regressor"]):
+    if body_part_estimator_name(source_config["regressor"]) != body_part_estimator_name(
+        trained.source_config["regressor"]
+    ):
         cause = "another limb finder than the estimating run's: train both with one regressor"
         raise InputError(folder, "regressor.kernel.limbs", cause)
-    material = still_frames(humanoid, regressor, made_with, task["context"] + task["minimum"])
+    dataset = still_frames(humanoid, regressor, source_config, task["context"] + task["minimum"])
     curves = None
     if follows:
-        material = still_futures(config, material)
-        curves = ForecastCurves(config, material, run_folder(folder))
-    agent = load_agent(folder, material)
-    env = agent.make_env("test", worlds=1 + settings.drawn, threads=1, whole_fragments=True, falls_end=False)
-    size = int(made_with["vision"]["flow"]["stored_size"])
-    seen = (planes_of(made_with["regressor"]), size, size)
+        dataset = still_forecasts(config, dataset)
+        curves = ForecastCurves(config, dataset, run_folder(folder))
+    agent = load_agent(folder, dataset)
+    env = agent.make_env("test", num_envs=1 + settings.drawn, threads=1, whole_fragments=True, falls_end=False)
+    size = int(source_config["vision"]["flow"]["stored_size"])
+    seen = (planes_of(source_config["regressor"]), size, size)
     return Forecaster(env, agent.actor, regressor, seen, settings, curves)
 
 
 def still_frames(
-    humanoid: HumanoidModel, regressor: StateRegressor, made_with: Mapping[str, Any], frames: int = 2
-) -> Material:
-    """The material of a take of still frames: what an environment needs to be made before anything is seen."""
-    size = int(made_with["vision"]["flow"]["stored_size"])
-    still = np.zeros((frames, planes_of(made_with["regressor"]), size, size), np.float16)
-    return video_material(humanoid, seen_in(humanoid, regressor, still, made_with), "stream")[0]
+    humanoid: HumanoidModel, regressor: StateRegressor, source_config: Mapping[str, Any], frames: int = 2
+) -> Dataset:
+    """The dataset of a take of still frames: what an environment needs to be made before anything is seen."""
+    size = int(source_config["vision"]["flow"]["stored_size"])
+    still = np.zeros((frames, planes_of(source_config["regressor"]), size, size), np.float16)
+    return video_dataset(humanoid, seen_in(humanoid, regressor, still, source_config), "stream")[0]
 
 
 def build_loop(
@@ -179,17 +181,19 @@ def build_loop(
     failsafe = from_mapping(FailSafeSettings, values["failsafe"], f"{_CONFIG}: failsafe").for_run(trained.config)
     limits = {name: values[name] for name in ("seconds", "bridge")}
     settings = from_mapping(LoopSettings, limits, _CONFIG)
-    flow = FlowConfig(**dict(trained.made_with["vision"]["flow"]))
+    flow = FlowConfig(**dict(trained.source_config["vision"]["flow"]))
     camera = Camera.from_mapping(values["camera"], "camera")
     rate = 1.0 / trained.humanoid.control_dt
     latency = LatencyTable(loop.STAGES, values["latency_frames"])
 
-    def parts(lap: Callable[[str], None]) -> tuple[Sight, CausalRegression, LiveBody]:
+    def parts(lap: Callable[[str], None]) -> tuple[FrameFeatures, CausalRegression, LiveBody]:
         """As at the start: nothing seen yet."""
         task, lookahead = trained.config["task"], values["lookahead"]
         return (
-            Sight(trained.regressor, flow, camera, rate, load_finder_of(trained.made_with["regressor"])),
-            causal_regression(trained.humanoid, trained.regressor, trained.made_with, task, lookahead),
+            FrameFeatures(
+                trained.regressor, flow, camera, rate, load_body_part_estimator_of(trained.source_config["regressor"])
+            ),
+            causal_regression(trained.humanoid, trained.regressor, trained.source_config, task, lookahead),
             LiveBody(trained.env, trained.actor, trained.critic, failsafe, lap),
         )
 
@@ -215,7 +219,7 @@ def _forecasts(values: Mapping[str, Any], forecaster: Forecaster, fallen_height:
     return ForecastThread(futures, every, values["lookahead"], latency, values["pace"] == "every")
 
 
-def warm_up(sight: Sight, regression: CausalRegression, body: LiveBody) -> None:
+def warm_up(sight: FrameFeatures, regression: CausalRegression, body: LiveBody) -> None:
     """Let all parts do their work on a still picture: the first time takes a hundred times as long."""
     still = np.zeros((64, 64, 3), np.uint8)
     poses = frame = 0

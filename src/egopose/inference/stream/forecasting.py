@@ -42,7 +42,7 @@ class ForecastThread:
     def __init__(
         self, futures: LiveFutures, every: int, lookahead: int, latency: LatencyTable, patient: bool = False
     ) -> None:
-        self.futures, self.latency = futures, latency
+        self.forecasts, self.latency = futures, latency
         self.made = self.skipped = 0
         self.every, self._patient = every, patient
         self._flow: deque[tuple[int, NDArray[np.float32]]] = deque(maxlen=futures.context + lookahead)
@@ -72,7 +72,7 @@ class ForecastThread:
         """
         if self._error is not None:
             raise self._error
-        first = frame - self.futures.context + 1
+        first = frame - self.forecasts.context + 1
         if frame < self._due or not self._flow or self._flow[0][0] > first:
             return
         self._due = frame + self.every
@@ -104,7 +104,7 @@ class ForecastThread:
         try:
             while (moment := self._next()) is not None:
                 self.latency.begin()
-                forecast = self.futures.roll(moment, self.latency.lap)
+                forecast = self.forecasts.roll(moment, self.latency.lap)
                 sink(forecast, 1e3 * (time.perf_counter() - moment.handed))
                 self.latency.lap("forecast_output")
                 self.latency.end(moment.handed)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from egopose.models.regressor import StateRegressor
-from egopose.vision.body_parts import PICTURE, LimbFinder, Picture, as_plane, pair_rows, small_picture
+from egopose.vision.body_parts import PICTURE, BodyPartEstimator, Picture, as_plane, pair_rows, small_picture
 from egopose.vision.flow import FlowConfig, FlowEstimator, grey_square
 from egopose.vision.lens import Camera, undo_rolling_shutter
 from egopose.vision.video import Frame
@@ -19,7 +19,7 @@ from egopose.vision.video import Frame
 _ROUNDING = 0.05
 
 
-class Sight:
+class FrameFeatures:
     """Lens, flow, shutter and encoder.
 
     Args:
@@ -36,7 +36,7 @@ class Sight:
         flow: FlowConfig,
         camera: Camera,
         rate: float,
-        finder: LimbFinder | None = None,
+        finder: BodyPartEstimator | None = None,
     ) -> None:
         self._regressor, self._size, self._camera, self._rate = regressor, flow.working_size, camera, rate
         self._estimator = FlowEstimator(flow)

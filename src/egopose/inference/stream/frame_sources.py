@@ -92,8 +92,8 @@ class SourceSettings:
     def __post_init__(self) -> None:
         if self.pace not in ("real_time", "every"):
             raise InputError(_CONFIG, "pace", f"must be real_time or every, not {self.pace!r}")
-        scheme, found, _ = self.source.partition("://")
-        if found and scheme.lower() not in SCHEMES:
+        scheme, result, _ = self.source.partition("://")
+        if result and scheme.lower() not in SCHEMES:
             raise InputError(self.label, "source", f"addresses begin with {', '.join(SCHEMES)}")
 
     @property

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from torchrl.envs import TransformedEnv
 
 from egopose.core.errors import InputError
-from egopose.envs.reference_forecasts import FollowFuture
+from egopose.envs.reference_forecasts import TrackForecast
 from egopose.models.recurrent import PastContext
 from egopose.models.regressor import StateRegressor
 from egopose.motion.rotations import Array
@@ -74,16 +74,16 @@ class FollowedCurve:
         joint_range: ``[nu, 2]`` rad.
     """
 
-    def __init__(self, follow: FollowFuture, regressor: StateRegressor, curves: Curves, joint_range: Array) -> None:
+    def __init__(self, follow: TrackForecast, regressor: StateRegressor, curves: Curves, joint_range: Array) -> None:
         self._follow, self._regressor, self._curves = follow, regressor, curves
         self.frames, self._joint_range = curves.context, joint_range
 
     def begin(self, features: Tensor, qpos: Array, qvel: Array, steps: int) -> Beginning:
         """A forecast begins where its curve does, as in training, standing and facing as the body."""
         states = self._regressor.from_features(features[None])["humanoid_state"].double()
-        start, futures = torch.zeros(1, dtype=torch.int64), self._follow.futures
-        futures.put(self._curves(states), start)
-        first = futures.first_state(start, torch.from_numpy(qpos)[None], self._joint_range)
+        start, forecasts = torch.zeros(1, dtype=torch.int64), self._follow.forecasts
+        forecasts.put(self._curves(states), start)
+        first = forecasts.first_state(start, torch.from_numpy(qpos)[None], self._joint_range)
         rows = torch.cat(self._follow.curve(start.expand(steps), torch.arange(steps)), dim=-1)
         return Beginning(first[0][0].numpy(), first[1][0].numpy(), rows)
 
@@ -97,7 +97,7 @@ def guide_of(
         InputError: the policy does not forecast.
     """
     past = parts_of(actor, PastContext)
-    follow = [part for part in env.transform if isinstance(part, FollowFuture)]
+    follow = [part for part in env.transform if isinstance(part, TrackForecast)]
     if follow and curves is not None:
         return FollowedCurve(follow[0], regressor, curves, env.base_env.problem.humanoid.joint_range)
     if len(past) != 1:

@@ -1,4 +1,4 @@
-"""Futures of a live body: the forecasting policy from one moment on, in worlds of its own.
+"""ReferenceForecasts of a live body: the forecasting policy from one moment on, in worlds of its own.
 
 As :func:`egopose.inference.forecaster.forecast` does with an environment, step by step to the same numbers, but with
 the policy's networks and the physics alone: beside a live stream every millisecond in Python is one that it waits.
@@ -21,7 +21,7 @@ from torchrl.modules import LSTMModule
 
 from egopose.core.errors import InputError
 from egopose.envs.env import EgoPoseEnv
-from egopose.envs.reference_forecasts import FollowFuture
+from egopose.envs.reference_forecasts import TrackForecast
 from egopose.envs.test_time import prepare_for_test
 from egopose.envs.transforms import StateNormalizer
 from egopose.inference.bands import quantile_bands
@@ -249,8 +249,8 @@ class _Step(nn.Module):
         (self.normalizer,) = (part for part in env.transform if isinstance(part, StateNormalizer))
         (self.head,) = parts_of(actor, GaussianHead)
         (reader,) = (p for p in actor.modules() if isinstance(p, TensorDictModule) and p.module is self.head)
-        following = [part for part in env.transform if isinstance(part, FollowFuture)]
-        self.follow: FollowFuture | None = following[0] if following else None
+        following = [part for part in env.transform if isinstance(part, TrackForecast)]
+        self.follow: TrackForecast | None = following[0] if following else None
         known = ["tracking_error"] if following else []
         if list(reader.in_keys[2:]) != known:
             cause = f"a live forecast knows the state and the past, not {', '.join(map(str, reader.in_keys[2:]))}"

@@ -18,7 +18,7 @@ from typing import Any
 from egopose.inference.causal import CausalRegression
 from egopose.inference.stream.clock import ControlClock
 from egopose.inference.stream.forecasting import ForecastSink, ForecastThread
-from egopose.inference.stream.frame_features import Sight
+from egopose.inference.stream.frame_features import FrameFeatures
 from egopose.inference.stream.frame_sources import SourceSettings, capture
 from egopose.inference.stream.latency import LatencyTable
 from egopose.inference.stream.live_body import LiveBody, LivePose
@@ -88,7 +88,7 @@ class LiveLoop:
     def __init__(
         self,
         source: SourceSettings,
-        sight: Sight,
+        sight: FrameFeatures,
         regression: CausalRegression,
         body: LiveBody,
         latency: LatencyTable,

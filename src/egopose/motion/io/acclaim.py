@@ -74,8 +74,8 @@ def _find_asf(path: Path) -> Path:
         return there[0]
     if not path.is_file():
         raise InputError(path, "path", "no such file")
-    found = f"{len(there)} others are there" if there else "none is there"
-    raise InputError(path, "option asf", f"no skeleton {path.stem.split('_')[0]}.asf beside it ({found}); name one")
+    result = f"{len(there)} others are there" if there else "none is there"
+    raise InputError(path, "option asf", f"no skeleton {path.stem.split('_')[0]}.asf beside it ({result}); name one")
 
 
 def _root_pose(asf: AsfFile, values: Array, scale: float) -> tuple[Array, Array]:

@@ -71,12 +71,12 @@ _PATTERNS = {"head": ("head", "neck"), "foot": ("foot|ankle", "toe", "leg|shin|c
 def named(skeleton: Skeleton, part: str) -> list[int]:
     """Joints whose names speak of the ``"head"`` or a ``"foot"``: the first in the tree of each branch."""
     for pattern in _PATTERNS[part]:
-        found: list[int] = []
+        result: list[int] = []
         for i, name in enumerate(skeleton.names):
-            if re.search(pattern, name.lower()) and not set(_ancestors(skeleton, i)) & set(found):
-                found.append(i)
-        if found:
-            return found
+            if re.search(pattern, name.lower()) and not set(_ancestors(skeleton, i)) & set(result):
+                result.append(i)
+        if result:
+            return result
     return []
 
 

@@ -137,8 +137,8 @@ def _parse(path: Path) -> tuple[str, Array]:
         raise InputError(path, "Frames", "a DeepMimic clip is a JSON object with a list of frames; there is none")
     for i, frame in enumerate(frames):
         if not isinstance(frame, list) or len(frame) != _COLUMNS:
-            found = f"{len(frame)} numbers" if isinstance(frame, list) else type(frame).__name__
-            raise InputError(path, f"Frames[{i}]", f"a frame is {_COLUMNS} numbers, found {found}")
+            result = f"{len(frame)} numbers" if isinstance(frame, list) else type(frame).__name__
+            raise InputError(path, f"Frames[{i}]", f"a frame is {_COLUMNS} numbers, found {result}")
         for k, value in enumerate(frame):
             if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < 1e6:
                 raise InputError(path, f"Frames[{i}]", f"number {k} is {value!r:.40}: not a finite number of sane size")
