@@ -14,7 +14,7 @@ from env_stand_in import group
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from test_blended import KERNEL, blended
-from test_limbs_seen import assert_frame_by_frame_as_the_video_up_to_there
+from test_body_parts_seen import assert_frame_by_frame_as_the_video_up_to_there
 from test_material import configuration, fill_flow
 from torch import Tensor
 
@@ -177,13 +177,15 @@ def test_limbs_mirrored_are_mirrored_in_the_units_of_their_numbers(pairs: int, s
 
 def test_rows_as_kept_are_mirrored_in_single_precision() -> None:
     rows = torch.randn(5, 2 * 89).half()
-    image = load_body_part_estimator("limbs").mirrored_rows(rows)
+    image = load_body_part_estimator("body_parts").mirrored_rows(rows)
     assert image.dtype == torch.float32
-    torch.testing.assert_close(image, load_body_part_estimator("limbs").mirrored_rows(rows.float()), rtol=0, atol=0)
+    torch.testing.assert_close(
+        image, load_body_part_estimator("body_parts").mirrored_rows(rows.float()), rtol=0, atol=0
+    )
 
 
 def test_the_shipped_finder_mirrors_as_the_humanoid_does(humanoid: HumanoidModel) -> None:
-    finder, mirror = load_body_part_estimator("limbs"), posture_mirror(humanoid.skeleton)
+    finder, mirror = load_body_part_estimator("body_parts"), posture_mirror(humanoid.skeleton)
     assert torch.equal(finder.mirror_index, mirror.index)
     assert torch.equal(finder.mirror_sign, mirror.sign)
     rows = torch.randn(20, 2 * finder.numbers)
@@ -221,7 +223,7 @@ def mirrored_clip(flow: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("cells", [2, 3])
-@pytest.mark.parametrize("limbs", [None, "limbs"])
+@pytest.mark.parametrize("limbs", [None, "body_parts"])
 def test_the_table_of_the_mirror_image_is_the_table_of_the_mirrored_clip(limbs: str | None, cells: int) -> None:
     chosen, draw = replace(SETTINGS, limbs=limbs, cells=cells), np.random.default_rng(5)
     flow = draw.normal(size=(40, 2, 14, 14)).astype(np.float32)

@@ -17,7 +17,7 @@ from egopose.data.prepare_motion import low_pass, reference_motion, without_lead
 from egopose.humanoid.foot_geometry import sole_names, sole_positions
 from egopose.motion import rotations as rot
 from egopose.motion.foot_contact_ik import plant_feet
-from egopose.motion.ground_alignment import GroundAlignmentSettings, settle
+from egopose.motion.ground_alignment import GroundAlignmentSettings, align_to_ground
 from egopose.motion.inverse_kinematics import Targets, solve
 from egopose.motion.io import read_motion
 from egopose.motion.kinematics import forward_kinematics
@@ -362,7 +362,7 @@ def jump(frames: int = 90, apex: float = 0.5) -> Motion:
 @given(height=st.floats(-3.0, 3.0))
 def test_a_standing_body_is_put_on_the_floor_from_anywhere(height: float) -> None:
     motion = standing(30, height)
-    settled, shift = settle(motion, sole_positions(HUMANOID, motion), GroundAlignmentSettings(depth=0.004))
+    settled, shift = align_to_ground(motion, sole_positions(HUMANOID, motion), GroundAlignmentSettings(depth=0.004))
     assert sole_positions(HUMANOID, settled)[..., 2] == pytest.approx(-0.004, abs=1e-6)
     assert shift == pytest.approx(-height - 0.004, abs=1e-6)
     assert settled.contacts is not None
@@ -372,7 +372,7 @@ def test_a_standing_body_is_put_on_the_floor_from_anywhere(height: float) -> Non
 
 def test_a_flight_keeps_its_height_and_its_pose() -> None:
     motion = jump()
-    settled, _ = settle(motion, sole_positions(HUMANOID, motion))
+    settled, _ = align_to_ground(motion, sole_positions(HUMANOID, motion))
     assert settled.contacts is not None
     assert not settled.contacts[35:55].any()
     flight = settled.qpos[30:60, 2] - settled.qpos[10, 2]
@@ -388,8 +388,10 @@ def test_a_flight_falls_as_gravity_has_it() -> None:
     fall = 0.125 * 9.81 * ((third + 1) / 30.0) ** 2
     flat = jump(frames, apex=0.67 * fall)
     body = flat.qpos[:, :3]
-    plain, _ = settle(flat, sole_positions(HUMANOID, flat), GroundAlignmentSettings(largest=1.0))
-    held, _ = settle(flat, sole_positions(HUMANOID, flat), GroundAlignmentSettings(largest=1.0), center_of_mass=body)
+    plain, _ = align_to_ground(flat, sole_positions(HUMANOID, flat), GroundAlignmentSettings(largest=1.0))
+    held, _ = align_to_ground(
+        flat, sole_positions(HUMANOID, flat), GroundAlignmentSettings(largest=1.0), center_of_mass=body
+    )
     rise = [float((m.qpos[30:60, 2] - m.qpos[10, 2]).max()) for m in (plain, held)]
     assert rise[0] == pytest.approx(0.67 * fall, rel=0.05)
     assert fall - rise[1] < 0.8 * (fall - rise[0])
@@ -402,7 +404,7 @@ def test_a_body_that_does_not_fall_is_put_on_the_floor() -> None:
     qpos[:, 0] += 3.0 * np.arange(90) / 30.0
     qpos[:, 2] += 0.04 * np.sin(np.arange(90) * 0.2) ** 2
     floating = replace(motion, qpos=qpos)
-    settled, _ = settle(floating, sole_positions(HUMANOID, floating), center_of_mass=floating.qpos[:, :3])
+    settled, _ = align_to_ground(floating, sole_positions(HUMANOID, floating), center_of_mass=floating.qpos[:, :3])
     assert np.abs(sole_positions(HUMANOID, settled)[..., 2] + 0.004).max() < 0.01
 
 
@@ -411,7 +413,7 @@ def test_a_slow_drift_of_the_floor_is_taken_out() -> None:
     qpos = motion.qpos.copy()
     qpos[:, 2] += np.linspace(-0.04, 0.04, 300)
     drifting = replace(motion, qpos=qpos)
-    settled, _ = settle(drifting, sole_positions(HUMANOID, drifting))
+    settled, _ = align_to_ground(drifting, sole_positions(HUMANOID, drifting))
     assert np.abs(sole_positions(HUMANOID, settled)[..., 2] + 0.004).max() < 0.005
 
 
@@ -434,7 +436,7 @@ def test_a_tilted_foot_is_planted_flat() -> None:
             qpos[:, 7 + HUMANOID.mj_model.actuator(side + name).id] = np.deg2rad(degrees)
     qpos[:, 7 + HUMANOID.mj_model.actuator("LeftFoot_0").id] += np.deg2rad(6.0)
     crouched = replace(motion, qpos=qpos)
-    tilted, _ = settle(crouched, sole_positions(HUMANOID, crouched))
+    tilted, _ = align_to_ground(crouched, sole_positions(HUMANOID, crouched))
     before, after = (sole_positions(HUMANOID, m)[..., 2] for m in (tilted, plant(tilted)))
     assert np.abs(before + 0.004).max() > 0.01
     assert np.abs(after + 0.004).max() < 0.003
@@ -445,7 +447,7 @@ def test_a_straight_leg_is_not_thrown_about() -> None:
     motion = standing(40)
     qpos = motion.qpos.copy()
     qpos[:, 7 + HUMANOID.mj_model.actuator("LeftFoot_0").id] = np.deg2rad(6.0)
-    tilted, _ = settle(replace(motion, qpos=qpos), sole_positions(HUMANOID, replace(motion, qpos=qpos)))
+    tilted, _ = align_to_ground(replace(motion, qpos=qpos), sole_positions(HUMANOID, replace(motion, qpos=qpos)))
     planted = plant(tilted)
     assert np.abs(planted.qpos[:, 7:] - tilted.qpos[:, 7:]).max() < np.deg2rad(20.0)
     before, after = (np.abs(sole_positions(HUMANOID, m)[..., 2] + 0.004).max() for m in (tilted, planted))

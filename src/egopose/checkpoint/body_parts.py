@@ -2,7 +2,7 @@
 
 Yuan & Kitani 2019 see through optical flow alone, in which arms that hardly move the head leave no trace. This looks at
 the picture itself: two frames, small, and the flow between them. It is trained on rendered bodies in random postures
-and rooms (``python -m egopose.limbs``), on no frame of any take that anything is judged on.
+and rooms (``python -m egopose.train --config-name body_parts``), on no frame of any take that anything is judged on.
 """
 
 from __future__ import annotations

@@ -28,6 +28,7 @@ from egopose.checkpoint.checksums import _files, check_files, seal
 from egopose.checkpoint.pretrained import is_shipped, shipped_run
 from egopose.core import safe_io
 from egopose.core.errors import InputError
+from egopose.core.former_names import upgraded
 from egopose.core.safe_tensors import check_checkpoint_files, check_checkpoint_states
 
 SCHEMA = 1
@@ -221,6 +222,8 @@ def require(metadata: Mapping[str, Any], path: str | Path, **expected: Any) -> N
 def read_json(path: str | Path, component: str) -> Any:
     """A JSON component (``config``, ``trainer_state``) without any object to load it into.
 
+    Settings of a ``config`` come under their present names.
+
     Raises:
         InputError: see :func:`verify`; or there is no such component.
     """
@@ -230,7 +233,7 @@ def read_json(path: str | Path, component: str) -> Any:
         raise InputError(path, component, "is missing in the checkpoint")
     value = safe_io.read_json(Path(path) / records[component]["path"] / "value.json", component)
     safe_io.check_sizes(value, Path(path))
-    return value
+    return upgraded(value) if component == "config" else value
 
 
 def rotation(run_dir: str | Path, keep_last: int) -> CheckpointRotation:

@@ -15,6 +15,7 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from egopose.checkpoint.checkpoint import read_json, recover
 from egopose.core.atomic_write import write_text_whole
 from egopose.core.errors import InputError
+from egopose.core.former_names import upgraded
 from egopose.core.safe_io import read_json as read_json_file
 from egopose.core.safe_io import read_yaml
 
@@ -140,7 +141,7 @@ def _saved_config(folder: Path, checkpoint: Path | None) -> dict[str, Any] | Non
         result = read_yaml(path, "config.yaml")
         if not isinstance(result, dict):
             raise InputError(path, "config.yaml", "cannot be read: is no mapping")
-        written = {str(key): value for key, value in result.items()}
+        written = upgraded({str(key): value for key, value in result.items()})
     if checkpoint is None:
         return written
     config = dict(read_json(checkpoint, "config"))

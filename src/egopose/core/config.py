@@ -26,6 +26,7 @@ from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
 from egopose.core.config_files import config_dir, setting_names
 from egopose.core.errors import InputError
+from egopose.core.former_names import RENAMED
 from egopose.core.safe_io import check_config_folder
 
 T = TypeVar("T")
@@ -128,6 +129,8 @@ def explained(name: str, error: HydraException) -> InputError:
     said = str(error)
     source = f"conf/{name}.yaml"
     if key := re.search(r"Could not override '([^']+)'", said):
+        if key[1] in RENAMED:
+            return InputError(source, key[1], f"is now called {RENAMED[key[1]]}")
         near = difflib.get_close_matches(key[1], setting_names(name), 1, 0.8)
         meant = f"; did you mean {near[0]}?" if near else ""
         return InputError(

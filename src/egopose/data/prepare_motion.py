@@ -1,4 +1,4 @@
-"""From any motion to a reference clip: on the humanoid's skeleton, at the control rate, settled on the floor."""
+"""From any motion to a reference clip: on the humanoid's skeleton, at the control rate, standing on the floor."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from egopose.humanoid.foot_geometry import sole_edges, sole_names, sole_position
 from egopose.humanoid.model import HumanoidModel
 from egopose.motion import rotations as rot
 from egopose.motion.foot_contact_ik import plant_feet
-from egopose.motion.ground_alignment import GroundAlignmentSettings, settle
+from egopose.motion.ground_alignment import GroundAlignmentSettings, align_to_ground
 from egopose.motion.motion import Motion
 from egopose.motion.retarget import RetargetReport, retarget
 
@@ -25,16 +25,16 @@ class PreparationSettings:
 
     Args:
         cutoff_hz: of the zero-lag low-pass over the retargeted motion; None for none.
-        settle: see :class:`egopose.motion.ground_alignment.GroundAlignmentSettings`.
+        ground_alignment: see :class:`egopose.motion.ground_alignment.GroundAlignmentSettings`.
     """
 
     cutoff_hz: float | None = 8.0
-    settle: GroundAlignmentSettings = field(default_factory=GroundAlignmentSettings)
+    ground_alignment: GroundAlignmentSettings = field(default_factory=GroundAlignmentSettings)
 
     @classmethod
     def from_mapping(cls, values: Mapping[str, Any]) -> PreparationSettings:
-        """From a resolved config group ``{cutoff_hz, settle: {...}}``."""
-        return cls(values.get("cutoff_hz", 8.0), GroundAlignmentSettings(**dict(values.get("settle", {}))))
+        """From a resolved config group ``{cutoff_hz, ground_alignment: {...}}``."""
+        return cls(values.get("cutoff_hz", 8.0), GroundAlignmentSettings(**dict(values.get("ground_alignment", {}))))
 
 
 def without_lead_in(motion: Motion) -> Motion:
@@ -71,7 +71,7 @@ def reference_motion(
     settings: PreparationSettings | None = None,
     overrides: dict[str, str] | None = None,
 ) -> tuple[Motion, RetargetReport]:
-    """Retarget, resample to the control rate and settle.
+    """Retarget, resample to the control rate and put on the floor.
 
     Args:
         motion: of any humanoid skeleton, z up.
@@ -95,10 +95,10 @@ def reference_motion(
         retargeted = low_pass(retargeted, settings.cutoff_hz)
     clip = retargeted.resample(fps)
     clip = replace(clip, contact_names=sole_names(humanoid), contacts=None)
-    clip, shift = settle(
+    clip, shift = align_to_ground(
         clip,
         sole_positions(humanoid, clip),
-        settings.settle,
+        settings.ground_alignment,
         sole_edges=sole_edges(humanoid, clip),
         center_of_mass=reference_states(humanoid, clip)["com"].numpy(),
     )
@@ -108,7 +108,7 @@ def reference_motion(
         humanoid.sole_points.reshape(-1, 3),
         sole_positions(humanoid, clip),
         humanoid.joint_range,
-        settings.settle.depth,
+        settings.ground_alignment.depth,
     )
     centred = clip.qpos.copy()
     centred[:, :2] -= centred[:1, :2]

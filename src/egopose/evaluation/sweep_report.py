@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from egopose.core.errors import InputError
+from egopose.core.former_names import upgraded
 from egopose.core.safe_io import read_json, read_yaml
 from egopose.evaluation import charts, page
 from egopose.evaluation.charts import Line
@@ -89,7 +90,7 @@ def read_jobs(folder: Path) -> list[Job]:
             results.parent.name: read_json(results, "results")
             for results in sorted(path.glob("evaluation/*/results.json"))
         }
-        settings = dict(_flat(read_yaml(path / "config.yaml", "config")))
+        settings = dict(_flat(upgraded(read_yaml(path / "config.yaml", "config"))))
         ended = (path / "finished.json").is_file()
         jobs.append(Job(path.name, settings, _read_curves(path / "curves.csv"), ended, evaluations))
     return jobs

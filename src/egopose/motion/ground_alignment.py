@@ -48,7 +48,7 @@ class GroundAlignmentSettings:
     largest: float = 0.08
 
 
-def settle(
+def align_to_ground(
     motion: Motion,
     sole_points: Array,
     settings: GroundAlignmentSettings | None = None,

@@ -47,10 +47,10 @@ def motion_files(motions: Sequence[str], exclude: Sequence[str]) -> list[Path]:
         result.update(there)
     kept = sorted(path for path in result if not any(fnmatch(path.name, one) for one in exclude))
     if not kept:
-        raise InputError("limbs", "motions", "exclude leaves none")
+        raise InputError("conf/body_parts.yaml", "motions", "exclude leaves none")
     names = [path.name for path in kept]
     if twice := sorted({name for name in names if names.count(name) > 1}):
-        raise InputError("limbs", "motions", f"two files are called {twice[0]}")
+        raise InputError("conf/body_parts.yaml", "motions", f"two files are called {twice[0]}")
     return kept
 
 
@@ -74,7 +74,9 @@ def base_clips(
         if len(clip) >= least_frames:
             out[path.name] = clip.qpos
     if not out:
-        raise InputError("limbs", "motions", f"all are shorter than pictures.least_frames={least_frames}")
+        raise InputError(
+            "conf/body_parts.yaml", "motions", f"all are shorter than pictures.least_frames={least_frames}"
+        )
     return out
 
 
@@ -84,11 +86,11 @@ def make_body_part_estimator(values: Mapping[str, Any]) -> dict[str, Any]:
     Raises:
         InputError: a motion or a setting cannot be used, or ``out`` holds what others made.
     """
-    out, seed = Path(str(values["out"])).expanduser(), convert(values["seed"], int, "limbs", "seed")
+    out, seed = Path(str(values["out"])).expanduser(), convert(values["seed"], int, "conf/body_parts.yaml", "seed")
     pictures = PictureSettings.from_config(values["pictures"])
     training = BodyPartSettings.from_config(values["training"])
-    motions = convert(values["motions"], tuple[str, ...], "limbs", "motions")
-    files = motion_files(motions, convert(values["exclude"], tuple[str, ...], "limbs", "exclude"))
+    motions = convert(values["motions"], tuple[str, ...], "conf/body_parts.yaml", "motions")
+    files = motion_files(motions, convert(values["exclude"], tuple[str, ...], "conf/body_parts.yaml", "exclude"))
     humanoid = humanoid_of(values)
     made_from = {"motions": {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in files}}
 
@@ -102,7 +104,9 @@ def make_body_part_estimator(values: Mapping[str, Any]) -> dict[str, Any]:
         FlowConfig(**values["vision"]["flow"]),
         pictures,
     )
-    draw_pictures(scenes, seed, out / "pictures", made_from, convert(values["workers"], int, "limbs", "workers"))
+    draw_pictures(
+        scenes, seed, out / "pictures", made_from, convert(values["workers"], int, "conf/body_parts.yaml", "workers")
+    )
 
     read = read_pictures(out / "pictures", pictures, ("pictures", "flow", "masks", "posture"))
     data = Pictures(**{name: torch.from_numpy(array) for name, array in read.items()})

@@ -25,7 +25,7 @@ from egopose.vision.features import extract_body_parts
 from egopose.vision.flow import FlowConfig
 from egopose.vision.lens import Camera
 
-_KEY = "limbs"
+_KEY = "body_parts"
 
 
 class FlowAndBodyParts:
@@ -90,7 +90,9 @@ def seen_in_store(
     flow, name = store.flow(flow_name), body_part_estimator_name(regressor)
     if name is None:
         return flow
-    table = f"limbs-{hashlib.sha256(json.dumps([flow_name, body_part_fingerprint(name)]).encode()).hexdigest()[:12]}"
+    table = (
+        f"body_parts-{hashlib.sha256(json.dumps([flow_name, body_part_fingerprint(name)]).encode()).hexdigest()[:12]}"
+    )
     if store.has_table(table):
         return FlowAndBodyParts(flow, store.table(table)[_KEY])
     rows = _find_body_parts(config, store, flow, load_body_part_estimator(name))
@@ -103,7 +105,7 @@ def _find_body_parts(config: Mapping[str, Any], store: TakeStore, flow: Tensor, 
 
     print(f"finding limbs in {store.frames_total} pictures", file=sys.stderr, flush=True)
     if not all(take.rendered for take in store.takes):
-        reported = "the limb finder has never seen a filmed body: compare with regressor.kernel.limbs=null"
+        reported = "the limb finder has never seen a filmed body: compare with regressor.kernel.body_parts=null"
         print(f"note: {reported}", file=sys.stderr, flush=True)
     settings = FlowConfig(**dict(config["vision"]["flow"]))
     rows = []

@@ -38,7 +38,7 @@ class KernelSettings:
         axes, whitening, ridge, length, metric_rows: see :func:`fit_kernel_regression`.
         centres: moments of training remembered at most, evenly chosen.
         share_step: the shares are multiples of it.
-        limbs: the limb finder whose answers the kernel sees too, by its name in the package; None for flow alone.
+        body_parts: the body-part estimator whose answers the kernel sees too, by its name in the package; None for flow alone.
         also: further sets of time windows ``(reach, step, width)``, each with a kernel of its own: the kernels' mean
             answers.
         mirror: every moment of training is remembered as its mirror image too.
@@ -55,7 +55,7 @@ class KernelSettings:
     metric_rows: int
     centres: int
     share_step: float
-    limbs: str | None = None
+    body_parts: str | None = None
     also: tuple[tuple[int, int, float], ...] = ()
     mirror: bool = False
 
@@ -77,7 +77,7 @@ class KernelSettings:
     @property
     def limb_numbers(self) -> int:
         """Numbers of a frame that come from the limb finder."""
-        return 0 if self.limbs is None else 2 * load_body_part_estimator(self.limbs).numbers
+        return 0 if self.body_parts is None else 2 * load_body_part_estimator(self.body_parts).numbers
 
     def windows(self) -> TimeWindows:
         return TimeWindows(self.reach, self.step, self.width, self.also)
@@ -216,8 +216,8 @@ def mirrored_view(view: Tensor, settings: KernelSettings) -> Tensor:
     """Mirror image of what the kernels see of each frame, ``[T, V]`` (:func:`egopose.models.blended.kernel_view`)."""
     flow, limbs = view.split([FLOW_CHANNELS * settings.cells**2, settings.limb_numbers], dim=1)
     parts = [StateMirror.flow(flow.unflatten(1, (FLOW_CHANNELS, settings.cells, settings.cells))).flatten(1)]
-    if settings.limbs is not None:
-        parts.append(load_body_part_estimator(settings.limbs).mirrored_rows(limbs))
+    if settings.body_parts is not None:
+        parts.append(load_body_part_estimator(settings.body_parts).mirrored_rows(limbs))
     return torch.cat(parts, dim=1)
 
 

@@ -34,7 +34,7 @@ _LIMB_MIRROR = [1, 0, 3, 2, 4]
 
 @dataclass(frozen=True)
 class BodyPartSettings:
-    """The group ``training`` of ``conf/limbs.yaml``.
+    """The group ``training`` of ``conf/body_parts.yaml``.
 
     Args:
         channels: of the finder's convolutions.
@@ -72,16 +72,16 @@ class BodyPartSettings:
     @classmethod
     def from_config(cls, values: Mapping[str, Any]) -> BodyPartSettings:
         """Raises InputError: a key is missing, unknown or out of range; names it."""
-        source = "conf/limbs.yaml: training"
+        source = "conf/body_parts.yaml: training"
         settings = from_mapping(cls, values, source)
         for name in ("batch", "warm_up", "save_every", "threads"):
             if getattr(settings, name) < 1:
                 raise InputError(
-                    "conf/limbs.yaml: training", name, f"must be at least 1, not {getattr(settings, name)}"
+                    "conf/body_parts.yaml: training", name, f"must be at least 1, not {getattr(settings, name)}"
                 )
         if settings.channels < 8 or settings.channels % 8:
             raise InputError(
-                "conf/limbs.yaml: training", "channels", f"must be a multiple of 8, not {settings.channels}"
+                "conf/body_parts.yaml: training", "channels", f"must be a multiple of 8, not {settings.channels}"
             )
         if not settings.epochs > 0:
             raise InputError(source, "epochs", f"must be more than 0, not {settings.epochs}")
@@ -181,7 +181,7 @@ class BodyPartTraining:
     def __init__(self, data: Pictures, skeleton: Skeleton, settings: BodyPartSettings, seed: int) -> None:
         if len(data) < settings.batch:
             cause = f"is {settings.batch}, and there are {len(data)} pictures to train on"
-            raise InputError("conf/limbs.yaml: training", "batch", cause)
+            raise InputError("conf/body_parts.yaml: training", "batch", cause)
         self.data, self.settings, self.seed = data, settings, seed
         self.mirror = posture_mirror(skeleton)
         with torch.random.fork_rng(devices=[]):

@@ -68,7 +68,7 @@ _RECORD = "pictures.json"
 
 @dataclass(frozen=True)
 class PictureSettings:
-    """The group ``pictures`` of ``conf/limbs.yaml``, which says where its numbers come from.
+    """The group ``pictures`` of ``conf/body_parts.yaml``, which says where its numbers come from.
 
     Args:
         samples: pictures in all.
@@ -115,12 +115,12 @@ class PictureSettings:
     @classmethod
     def from_config(cls, values: Mapping[str, Any]) -> PictureSettings:
         """Raises InputError: a key is missing, unknown or out of range; names it."""
-        settings = from_mapping(cls, values, "conf/limbs.yaml: pictures")
+        settings = from_mapping(cls, values, "conf/body_parts.yaml: pictures")
         for name in ("samples", "rooms_a_part", "wearings", "pairs", "least_frames", "steps"):
             least = 2 if name == "least_frames" else 1
             if getattr(settings, name) < least:
                 cause = f"must be at least {least}, not {getattr(settings, name)}"
-                raise InputError("conf/limbs.yaml: pictures", name, cause)
+                raise InputError("conf/body_parts.yaml: pictures", name, cause)
         return settings
 
     @property
@@ -167,11 +167,11 @@ class Scenes:
         rooms = self.render.room.train_rooms + self.render.room.test_rooms
         if self.settings.first_room < rooms:
             cause = f"is {self.settings.first_room}, and takes are seen in the rooms up to {rooms - 1}"
-            raise InputError("conf/limbs.yaml: pictures", "first_room", cause)
+            raise InputError("conf/body_parts.yaml: pictures", "first_room", cause)
         if self.flow.stored_size != FLOW:
             raise InputError("vision.flow", "stored_size", f"is {self.flow.stored_size}; limb finders see {FLOW}")
         if not self.clips or min(len(clip) for clip in self.clips) < 2:
-            raise InputError("limbs", "motions", "no clip of two frames or more")
+            raise InputError("conf/body_parts.yaml", "motions", "no clip of two frames or more")
 
 
 def posture_names(skeleton: Skeleton) -> list[str]:

@@ -143,7 +143,7 @@ def load_forecaster(values: Mapping[str, Any], trained: Trained) -> Forecaster |
         trained.source_config["regressor"]
     ):
         cause = "another limb finder than the estimating run's: train both with one regressor"
-        raise InputError(folder, "regressor.kernel.limbs", cause)
+        raise InputError(folder, "regressor.kernel.body_parts", cause)
     dataset = still_frames(humanoid, regressor, source_config, task["context"] + task["minimum"])
     curves = None
     if follows:

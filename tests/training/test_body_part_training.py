@@ -11,12 +11,12 @@ import pytest
 import torch
 
 import egopose
-from egopose import limbs
 from egopose.checkpoint.checkpoint import RunCheckpoint, read_json
 from egopose.core.config import compose_config
 from egopose.core.errors import InputError
 from egopose.data.preparation import humanoid_of
 from egopose.motion.skeleton import Skeleton
+from egopose.pipeline import body_parts
 from egopose.training import body_parts as limb_finder
 from egopose.training.body_parts import (
     BodyPartSettings,
@@ -38,7 +38,7 @@ SMALL = ["training.channels=8", "training.batch=4", "training.threads=1", "train
 
 @pytest.fixture(scope="module")
 def config() -> dict[str, Any]:
-    return compose_config("limbs", [f"motions=['{WALK}']", "out=x", *SMALL])
+    return compose_config("body_parts", [f"motions=['{WALK}']", "out=x", *SMALL])
 
 
 @pytest.fixture(scope="module")
@@ -165,18 +165,18 @@ def test_a_finder_is_kept_without_pickle_and_comes_back(
 def test_the_verb_draws_trains_keeps_and_does_nothing_twice(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     tiny = ["pictures.samples=24", "pictures.rooms_a_part=1", "pictures.wearings=2", "pictures.pairs=6", "workers=1"]
     tiny += ["vision.room.texture_size=64", "training.held_out=0.25", "training.epochs=1"]
-    values = compose_config("limbs", [f"motions=['{WALK}']", f"out={tmp_path / 'out'}", *SMALL, *tiny])
-    card = limbs.make_body_part_estimator(values)
+    values = compose_config("body_parts", [f"motions=['{WALK}']", f"out={tmp_path / 'out'}", *SMALL, *tiny])
+    card = body_parts.make_body_part_estimator(values)
     assert (card["samples"], card["held_out"]) == (24, 6)
     assert list(card["motions"]) == [WALK.name]
     assert set(card["figures"]["masks"]) == set(LIMBS)
     assert read_json(tmp_path / "out" / "finder", "card") == json.loads(json.dumps(card))
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["finder", "pictures"]
     monkeypatch.setattr(limb_finder, "train_body_part_estimator", lambda *_: pytest.fail("it is trained already"))
-    assert limbs.make_body_part_estimator(values) == json.loads(json.dumps(card))
+    assert body_parts.make_body_part_estimator(values) == json.loads(json.dumps(card))
     values["training"]["epochs"] = 2
     with pytest.raises(InputError, match="finder of other settings"):
-        limbs.make_body_part_estimator(values)
+        body_parts.make_body_part_estimator(values)
 
 
 def test_settings_that_cannot_be_are_told(

@@ -43,12 +43,12 @@ from egopose.vision.takes import RenderConfig
 
 PACKAGE = Path(egopose.__file__).parent
 WALK = PACKAGE / "assets" / "clips" / "deepmimic_walk.motion.npz"
-SHIPPED = PACKAGE / "weights" / "limbs"
+SHIPPED = PACKAGE / "weights" / "body_parts"
 
 
 @pytest.fixture(scope="module")
 def config() -> dict[str, Any]:
-    return compose_config("limbs", ["motions=[x]", "out=x"])
+    return compose_config("body_parts", ["motions=[x]", "out=x"])
 
 
 @pytest.fixture(scope="module")

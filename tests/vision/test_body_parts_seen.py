@@ -293,8 +293,8 @@ def test_a_regressor_sees_limbs_only_where_its_kernel_names_a_finder() -> None:
     assert planes_of({"kernel": KERNEL}) == 2
     assert load_body_part_estimator_of({"kernel": KERNEL}) is None
     chosen = compose_config("train", ["regressor=blended"])["regressor"]
-    assert (body_part_estimator_name(chosen), planes_of(chosen)) == ("limbs", 3)
-    finder = load_body_part_estimator("limbs")
+    assert (body_part_estimator_name(chosen), planes_of(chosen)) == ("body_parts", 3)
+    finder = load_body_part_estimator("body_parts")
     assert load_body_part_estimator_of(chosen) is finder
     assert from_mapping(KernelSettings, chosen["kernel"], "x").limb_numbers == 2 * finder.numbers
     assert not finder.training
@@ -305,7 +305,7 @@ def test_a_regressor_sees_limbs_only_where_its_kernel_names_a_finder() -> None:
 
 def test_the_regressors_name_tells_what_it_saw_limbs_with(monkeypatch: pytest.MonkeyPatch) -> None:
     config, store = compose_config("train", ["regressor=blended"]), SimpleNamespace(fingerprint="f")
-    without = compose_config("train", ["regressor=blended", "regressor.kernel.limbs=null"])
+    without = compose_config("train", ["regressor=blended", "regressor.kernel.body_parts=null"])
     names = [regressor_name(one, store, "flow") for one in (config, without)]
     monkeypatch.setattr(sight, "load_body_part_estimator", lambda _: finder_of_chance(seed=4))
     names += [regressor_name(one, store, "flow") for one in (config, without)]
@@ -313,9 +313,9 @@ def test_the_regressors_name_tells_what_it_saw_limbs_with(monkeypatch: pytest.Mo
     assert names[1] == names[3], "without limbs it is nobody's affair what the finder is"
     other = finder_of_chance(seed=4)
     other.posture.bias.data[0] += 1e-3
-    before = body_part_fingerprint("limbs")
+    before = body_part_fingerprint("body_parts")
     monkeypatch.setattr(sight, "load_body_part_estimator", lambda _: other)
-    assert body_part_fingerprint("limbs") != before
+    assert body_part_fingerprint("body_parts") != before
 
 
 def test_a_live_forecast_needs_the_limbs_of_the_estimating_run(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -329,9 +329,9 @@ def test_a_live_forecast_needs_the_limbs_of_the_estimating_run(monkeypatch: pyte
     chosen = compose_config("stream", ["source=none", "checkpoint=none", "forecast.checkpoint=forecasts"])
     seeing = {
         **trained.source_config,
-        "regressor": {**trained.source_config["regressor"], "kernel": {"limbs": "limbs"}},
+        "regressor": {**trained.source_config["regressor"], "kernel": {"body_parts": "body_parts"}},
     }
-    with pytest.raises(InputError, match=r"regressor\.kernel\.limbs"):
+    with pytest.raises(InputError, match=r"regressor\.kernel\.body_parts"):
         load_forecaster(chosen, replace(trained, source_config=seeing))
 
 
@@ -350,7 +350,7 @@ def test_a_store_keeps_the_finders_rows_and_its_regressor_is_read_back(
     folder: Path, finder: BodyPartEstimator, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     config = blended(folder)
-    config["regressor"]["kernel"] = {**KERNEL, "limbs": "limbs"}
+    config["regressor"]["kernel"] = {**KERNEL, "body_parts": "body_parts"}
     store, humanoid, flow = TakeStore.open(folder / "store"), humanoid_of(config), flow_name(config)
     known = torch.randn(store.frames_total, 2 * finder.numbers).half()
     asked: list[Any] = []
@@ -373,9 +373,9 @@ def test_a_store_keeps_the_finders_rows_and_its_regressor_is_read_back(
     # Flow and limbs of chance tell nothing: either share would be nought, and nothing of the kernel be compared.
     monkeypatch.setattr(blending, "choose_shares", lambda *_: (0.3, 0.6))
     tables, weights = regressor_tables(config, store, humanoid, flow)
-    kept = sorted(path.name for path in (store.root / "tables").glob("limbs-*"))
+    kept = sorted(path.name for path in (store.root / "tables").glob("body_parts-*"))
     assert len(kept) == 1
-    assert store.table_card(kept[0]) == {"flow": flow, "finder": "limbs"}
+    assert store.table_card(kept[0]) == {"flow": flow, "finder": "body_parts"}
     asked.clear()
     np.testing.assert_array_equal(seen_in_store(config, config["regressor"], store, flow)[:], wanted)
     assert not asked, "the table is read"

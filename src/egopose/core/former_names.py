@@ -1,0 +1,58 @@
+"""Settings that were renamed or removed since a run was saved, in one table: old run directories keep loading."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Mapping
+from typing import Any
+
+#: Former dotted name -> present one.
+RENAMED = {
+    "collector.worlds": "collector.num_envs",
+    "collector.lanes": "collector.env_groups",
+    "collector.lanes_from": "collector.env_groups_from",
+    "training.evaluation_worlds": "training.evaluation_num_envs",
+    "data.preparation.ground_alignment": "data.preparation.ground_alignment",
+    "regressor.kernel.body_parts": "regressor.kernel.body_parts",
+    # Of conf/evaluate, estimate, stream and planner: on command lines alone, no run keeps them.
+    "survival.worlds": "survival.num_envs",
+    "forecast.worlds": "forecast.num_envs",
+    "failsafe.kappa": "failsafe.reset_threshold",
+    "planner.kappa": "planner.reset_threshold",
+    "planner.rescue": "planner.recovery_rounds",
+    "planner.sinking": "planner.height_drop",
+    "planner.near": "planner.tie_tolerance",
+    "planner.knot": "planner.knot_spacing",
+}
+#: Settings without a successor: what they asked for is gone.
+REMOVED = ("training.evaluate_async",)
+#: Dotted name -> {former value: present one}.
+VALUES: dict[str, dict[Any, Any]] = {"regressor.kernel.body_parts": {"limbs": "body_parts"}}
+
+
+def upgraded(config: Mapping[str, Any]) -> dict[str, Any]:
+    """A copy of a configuration, or of some groups of one, under the present names."""
+    out: dict[str, Any] = copy.deepcopy(dict(config))
+    for old, new in RENAMED.items():
+        parent, name = _parent(out, old)
+        if parent is not None and name in parent:
+            value = parent.pop(name)
+            _parent(out, new)[0].setdefault(new.rpartition(".")[2], value)  # type: ignore[union-attr]
+    for gone in REMOVED:
+        parent, name = _parent(out, gone)
+        if parent is not None:
+            parent.pop(name, None)
+    for field, values in VALUES.items():
+        parent, name = _parent(out, field)
+        if parent is not None and parent.get(name) in values:
+            parent[name] = values[parent[name]]
+    return out
+
+
+def _parent(config: dict[str, Any], field: str) -> tuple[dict[str, Any] | None, str]:
+    """The mapping that holds a dotted field, None where there is none, and the field's last name."""
+    *path, name = field.split(".")
+    inner: Any = config
+    for part in path:
+        inner = inner.get(part) if isinstance(inner, dict) else None
+    return (inner if isinstance(inner, dict) else None), name
