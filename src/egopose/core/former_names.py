@@ -12,8 +12,8 @@ RENAMED = {
     "collector.lanes": "collector.env_groups",
     "collector.lanes_from": "collector.env_groups_from",
     "training.evaluation_worlds": "training.evaluation_num_envs",
-    "data.preparation.ground_alignment": "data.preparation.ground_alignment",
-    "regressor.kernel.body_parts": "regressor.kernel.body_parts",
+    "data.preparation.settle": "data.preparation.ground_alignment",
+    "regressor.kernel.limbs": "regressor.kernel.body_parts",
     # Of conf/evaluate, estimate, stream and planner: on command lines alone, no run keeps them.
     "survival.worlds": "survival.num_envs",
     "forecast.worlds": "forecast.num_envs",

@@ -189,7 +189,7 @@ def windows_of(agent: Agent, split: str, settings: ForecastSettings) -> list[For
 def _pasts(
     config: Mapping[str, Any], agent: Agent, windows: Sequence[ForecastWindow], settings: ForecastSettings
 ) -> Tensor:
-    """:func:`~egopose.inference.forecast_contexts.past_states` as ``conf/evaluate.yaml`` says, some windows at a time."""
+    """:func:`~egopose.inference.forecast_contexts.past_states` as ``conf/evaluate.yaml`` says, in parts."""
     failsafe = from_mapping(FailSafeSettings, config["failsafe"], "conf/evaluate.yaml: failsafe")
     parts = [windows[at : at + settings.num_envs] for at in range(0, len(windows), settings.num_envs)]
     threads = int(config["threads"])

@@ -38,7 +38,7 @@ class KernelSettings:
         axes, whitening, ridge, length, metric_rows: see :func:`fit_kernel_regression`.
         centres: moments of training remembered at most, evenly chosen.
         share_step: the shares are multiples of it.
-        body_parts: the body-part estimator whose answers the kernel sees too, by its name in the package; None for flow alone.
+        body_parts: name of the body-part estimator whose answers the kernel sees too; None for flow alone.
         also: further sets of time windows ``(reach, step, width)``, each with a kernel of its own: the kernels' mean
             answers.
         mirror: every moment of training is remembered as its mirror image too.

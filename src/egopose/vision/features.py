@@ -67,7 +67,9 @@ def extract_body_parts(
     offset: float,
     camera: Camera | None,
 ) -> NDArray[np.float16]:
-    """``[T, 2 Q]`` of a video whose flow ``[T, 2, S, S]`` is there, see :func:`~egopose.vision.body_parts.body_part_rows`.
+    """Body parts ``[T, 2 Q]`` of a video whose flow ``[T, 2, S, S]`` is there.
+
+    See :func:`~egopose.vision.body_parts.body_part_rows`.
 
     Other arguments, and errors, as of :func:`extract_flow`.
     """
