@@ -11,9 +11,10 @@ from humanoid_stand_in import StandIn, reference_motion, stand_in
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
-from egopose.envs.build import build_env, build_problem
 from egopose.envs.env import EgoPoseEnv
-from egopose.envs.problem import ImitationProblem
+from egopose.envs.imitation import ActionSettings, ImitationProblem, TerminationSettings
+from egopose.envs.mdp.rewards import build_reward
+from egopose.envs.starts import WholeFragments, training_starts
 
 
 class Piece(NamedTuple):
@@ -30,6 +31,14 @@ def group(name: str, option: str) -> dict[str, Any]:
     """One config file as the mains see it."""
     with initialize_config_dir(str(Path(__file__).parents[1] / "conf"), version_base="1.3"):
         return dict(OmegaConf.to_container(compose(f"{name}/{option}")[name], resolve=True))
+
+
+def build_problem(
+    humanoid: Any, reference: Any, takes: Any, task: dict[str, Any], reward: dict[str, Any], **tables: Any
+) -> ImitationProblem:
+    """The imitation problem of a file of ``conf/task`` and one of ``conf/reward``."""
+    settings = ActionSettings(**task["action"]), TerminationSettings(**task["termination"])
+    return ImitationProblem(humanoid, reference, takes, build_reward(reward), *settings, **tables)
 
 
 def problem(
@@ -51,7 +60,13 @@ def problem(
     )
 
 
-def environment(n: int, *, horizon: int = 15, minimum: int = 8, **kwargs: Any) -> EgoPoseEnv:
-    given = kwargs.pop("problem", None) or problem()
-    task = {"horizon": horizon, "minimum": minimum}
-    return build_env(given, kwargs.pop("fragments", PIECES), n, task, **kwargs)
+def environment(
+    n: int, *, horizon: int = 15, minimum: int = 8, whole_fragments: bool = False, starts: Any = None, **kwargs: Any
+) -> EgoPoseEnv:
+    given, fragments = kwargs.pop("problem", None) or problem(), kwargs.pop("fragments", PIECES)
+    offsets, lengths = given.takes.offsets, given.takes.lengths
+    if whole_fragments:
+        dealt: Any = WholeFragments(fragments, offsets, lengths)
+    else:
+        dealt = training_starts(starts, fragments, offsets, lengths, horizon, minimum)
+    return EgoPoseEnv(given, n, dealt, **kwargs)

@@ -7,13 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from env_stand_in import PIECES, Piece, environment, group, problem
+from env_stand_in import PIECES, Piece, build_problem, environment, group, problem
 from humanoid_stand_in import reference_motion, stand_in
 from tensordict import TensorDict
 from torchrl.collectors import Collector
 from torchrl.envs.utils import check_env_specs
 
-from egopose.envs.build import build_problem
 from egopose.envs.starts import UniformStarts, WholeFragments
 
 NO_FALL = {"enabled": False, "head_drop": 0.1}
@@ -55,7 +54,7 @@ def test_time_and_reward_belong_to_the_frame_reached() -> None:
     td = env.step(td.set("action", torch.zeros(env.action_spec.shape)))["next"]
     assert (td["frame"].squeeze(-1) == frame + 1).all()
     state = env.body_state()
-    reward, terms = p.rewards(state, frame + 1, torch.ones(4))
+    reward, terms = p.rewards(p.step_view(state, frame + 1, torch.ones(4)))
     torch.testing.assert_close(td["reward"].squeeze(-1), reward.float())
     for name, value in terms.items():
         torch.testing.assert_close(td["reward_terms", name].squeeze(-1), value.float())

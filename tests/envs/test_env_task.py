@@ -34,7 +34,9 @@ def test_both_environments_agree(scale: float) -> None:
         action = rng.normal(0, scale, batch.action_spec.shape[-1]).astype(np.float32)
         step = one.step(action)
         td = batch.step(td.set("action", torch.from_numpy(action).expand(3, -1)))["next"]
-        reward, terms = batch.problem.rewards(batch.body_state(), batch.frame, td["episode_step"].squeeze(-1))
+        reward, terms = batch.problem.rewards(
+            batch.problem.step_view(batch.body_state(), batch.frame, td["episode_step"].squeeze(-1))
+        )
         assert step.reward == pytest.approx(reward[1].item(), abs=1e-9)
         assert one.task.reward_terms == pytest.approx({k: v[1].item() for k, v in terms.items()}, abs=1e-9)
         assert step.last() == td["done"][1].item()

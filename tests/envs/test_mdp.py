@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+from typing import Any
+
 import numpy as np
 import pytest
 import torch
@@ -11,22 +14,37 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 from tensordict import TensorDict
 
+from egopose.core.config import compose_config
+from egopose.core.former_names import upgraded
 from egopose.envs.mdp import observations as obs
 from egopose.envs.mdp import rewards
 from egopose.envs.mdp import rotations as rot
+from egopose.envs.mdp.step_view import StepView
 from egopose.envs.mdp.terminations import fallen
 
 UNTURNED = torch.tensor([[1.0, 0.0, 0.0, 0.0]], dtype=torch.float64)
-SCALES = {
-    "pose": 2.0,
-    "end_effector": 20.0,
-    "root_pose": 300.0,
-    "root_linear_velocity": 1.0,
-    "root_angular_velocity": 0.1,
-}
 WEIGHTS = {"pose": 0.5, "end_effector": 0.3, "root_pose": 0.1, "root_velocity": 0.1}
-WORLD = {"pose": 2.0, "velocity": 0.1, "end_effector": 40.0, "centre_of_mass": 10.0}
-WORLD_WEIGHTS = {"pose": 0.65, "velocity": 0.1, "end_effector": 0.15, "centre_of_mass": 0.1}
+SCALES = {
+    "pose": {"scale": 2.0},
+    "end_effector": {"scale": 20.0},
+    "root_pose": {"scale": 300.0},
+    "root_velocity": {"scale": 1.0, "angular_scale": 0.1},
+}
+WORLD_WEIGHTS = {"world_pose": 0.65, "joint_velocity": 0.1, "world_end_effector": 0.15, "centre_of_mass": 0.1}
+WORLD = {
+    "world_pose": {"scale": 2.0},
+    "joint_velocity": {"scale": 0.1},
+    "world_end_effector": {"scale": 40.0},
+    "centre_of_mass": {"scale": 10.0},
+}
+
+
+def table(
+    weights: dict[str, float], scales: dict[str, dict[str, float]], metric: str = "half_angle", **options: Any
+) -> rewards.RewardTable:
+    """As a file of ``conf/reward`` describes it."""
+    terms = {name: {"weight": weight, **scales[name]} for name, weight in weights.items()}
+    return rewards.build_reward({"combine": "mean", "rotation_metric": metric, "terms": terms} | options)
 
 
 def scipy(q: torch.Tensor) -> Rotation:
@@ -46,8 +64,8 @@ def body() -> tuple[StandIn, TensorDict, obs.BodyLayout]:
     return humanoid, reference, layout
 
 
-def judged(reward: rewards.Reward, layout: obs.BodyLayout, state: TensorDict, reference: TensorDict, step):
-    return reward(obs.BodyView(state, layout), obs.BodyView(reference, layout), step)
+def judged(reward: rewards.RewardTable, layout: obs.BodyLayout, state: TensorDict, reference: TensorDict, step):
+    return reward(StepView(obs.BodyView(state, layout), obs.BodyView(reference, layout), step))
 
 
 def moved(state: TensorDict, yaw: float, shift: tuple[float, float]) -> TensorDict:
@@ -126,7 +144,7 @@ def test_joint_rotations_are_the_hinges(body) -> None:
 def test_each_term_by_hand(body) -> None:
     _, reference, layout = body
     a, b = reference[:20], reference[20:40]
-    view, other = obs.BodyView(a, layout), obs.BodyView(b, layout)
+    seen = StepView(obs.BodyView(a, layout), obs.BodyView(b, layout), torch.zeros(len(a)))
 
     def relative(state: TensorDict, child: int) -> Rotation:
         parent = int(layout.parents[child - 1])
@@ -139,14 +157,14 @@ def test_each_term_by_hand(body) -> None:
     angles = np.stack([(relative(a, j) * relative(b, j).inv()).magnitude() for j in range(1, a["xquat"].shape[1])], 1)
     for metric, factor in (("half_angle", 0.5), ("angle", 1.0)):
         expected = np.exp(-2 * ((factor * angles) ** 2).sum(1))
-        np.testing.assert_allclose(rewards.pose(view, other, 2.0, metric), expected, rtol=1e-9)
+        np.testing.assert_allclose(rewards.pose(seen, scale=2.0, metric=metric), expected, rtol=1e-9)
 
     def ends(state: TensorDict) -> np.ndarray:
         vectors = (state["xpos"][:, layout.end_effectors] - state["qpos"][:, None, :3]).numpy()
         return np.stack([heading(state).inv().apply(vectors[:, e]) for e in range(vectors.shape[1])], 1)
 
     expected = np.exp(-20 * ((ends(a) - ends(b)) ** 2).sum((1, 2)))
-    np.testing.assert_allclose(rewards.end_effector(view, other, 20.0), expected, rtol=1e-9)
+    np.testing.assert_allclose(rewards.end_effector(seen, scale=20.0), expected, rtol=1e-9)
 
     def tilt(state: TensorDict) -> Rotation:
         return heading(state).inv() * scipy(state["qpos"][:, 3:7])
@@ -154,7 +172,7 @@ def test_each_term_by_hand(body) -> None:
     height = (a["qpos"][:, 2] - b["qpos"][:, 2]).numpy()
     lean = 0.5 * (tilt(a) * tilt(b).inv()).magnitude()
     expected = np.exp(-300 * (height**2 + lean**2))
-    np.testing.assert_allclose(rewards.root_pose(view, other, 300.0, "half_angle"), expected, rtol=1e-9)
+    np.testing.assert_allclose(rewards.root_pose(seen, scale=300.0, metric="half_angle"), expected, rtol=1e-9)
 
     def velocity(state: TensorDict, columns: slice, frame: Rotation) -> np.ndarray:
         return frame.apply(state["qvel"][:, columns].numpy())
@@ -162,24 +180,24 @@ def test_each_term_by_hand(body) -> None:
     dl = velocity(a, slice(0, 3), heading(a).inv()) - velocity(b, slice(0, 3), heading(b).inv())
     dw = velocity(a, slice(3, 6), tilt(a)) - velocity(b, slice(3, 6), tilt(b))
     expected = np.exp(-(dl**2).sum(1) - 0.1 * (dw**2).sum(1))
-    np.testing.assert_allclose(rewards.root_velocity(view, other, 1.0, 0.1), expected, rtol=1e-9)
+    np.testing.assert_allclose(rewards.root_velocity(seen, scale=1.0, angular_scale=0.1), expected, rtol=1e-9)
 
 
 def test_deepmimic_terms_by_hand(body) -> None:
     _, reference, layout = body
     a, b = reference[:20], reference[20:40]
-    view, other = obs.BodyView(a, layout), obs.BodyView(b, layout)
+    seen = StepView(obs.BodyView(a, layout), obs.BodyView(b, layout), torch.zeros(len(a)))
     dv = (a["qvel"] - b["qvel"])[:, 6:].numpy()
-    np.testing.assert_allclose(rewards.joint_velocity(view, other, 0.1), np.exp(-0.1 * (dv**2).sum(1)), rtol=1e-9)
+    np.testing.assert_allclose(rewards.joint_velocity(seen, scale=0.1), np.exp(-0.1 * (dv**2).sum(1)), rtol=1e-9)
     dc = (a["com"] - b["com"]).numpy()
-    np.testing.assert_allclose(rewards.centre_of_mass(view, other, 10.0), np.exp(-10 * (dc**2).sum(1)), rtol=1e-9)
+    np.testing.assert_allclose(rewards.centre_of_mass(seen, scale=10.0), np.exp(-10 * (dc**2).sum(1)), rtol=1e-9)
     de = (a["xpos"] - b["xpos"])[:, layout.end_effectors].numpy()
     expected = np.exp(-40 * (de**2).sum((1, 2)))
-    np.testing.assert_allclose(rewards.world_end_effector(view, other, 40.0), expected, rtol=1e-9)
+    np.testing.assert_allclose(rewards.world_end_effector(seen, scale=40.0), expected, rtol=1e-9)
     root = (scipy(a["qpos"][:, 3:7]) * scipy(b["qpos"][:, 3:7]).inv()).magnitude()
-    without_root = rewards.pose(view, other, 2.0, "angle").numpy()
+    without_root = rewards.pose(seen, scale=2.0, metric="angle").numpy()
     expected = without_root * np.exp(-2 * root**2)
-    np.testing.assert_allclose(rewards.world_pose(view, other, 2.0, "angle"), expected, rtol=1e-9)
+    np.testing.assert_allclose(rewards.world_pose(seen, scale=2.0, metric="angle"), expected, rtol=1e-9)
 
 
 @given(yaw=st.floats(-10, 10), x=st.floats(-50, 50), y=st.floats(-50, 50))
@@ -187,7 +205,7 @@ def test_deepmimic_terms_by_hand(body) -> None:
 def test_heading_turn_and_travel_change_nothing(body, yaw: float, x: float, y: float) -> None:
     _, reference, layout = body
     a, b = reference[:10], reference[10:20]
-    reward = rewards.HeadingFrameReward(WEIGHTS, SCALES)
+    reward = table(WEIGHTS, SCALES)
     step = torch.zeros(10, dtype=torch.int64)
     here, there = (judged(reward, layout, state, b, step)[0] for state in (a, moved(a, yaw, (x, y))))
     np.testing.assert_allclose(here, there, rtol=1e-7)
@@ -198,9 +216,9 @@ def test_heading_turn_and_travel_change_nothing(body, yaw: float, x: float, y: f
 def test_deepmimic_sees_travel(body) -> None:
     _, reference, layout = body
     a = reference[:10]
-    reward = rewards.WorldFrameReward(WORLD_WEIGHTS, WORLD)
+    reward = table(WORLD_WEIGHTS, WORLD, "angle")
     total, terms = judged(reward, layout, moved(a, 0.0, (0.5, 0.0)), a, torch.zeros(10))
-    assert (terms["pose"] == 1).all()
+    assert (terms["world_pose"] == 1).all()
     assert (terms["centre_of_mass"] < 0.1).all()
     assert (total < 0.95).all()
 
@@ -208,13 +226,14 @@ def test_deepmimic_sees_travel(body) -> None:
 @pytest.mark.parametrize(
     "reward",
     [
-        rewards.HeadingFrameReward(WEIGHTS, SCALES),
-        rewards.HeadingFrameReward(WEIGHTS, SCALES, "angle"),
-        rewards.HeadingFrameReward({"pose": 0.5, "end_effector": 0.3, "root_pose": 0.0, "root_velocity": 0.0}, SCALES),
-        rewards.WorldFrameReward(WORLD_WEIGHTS, WORLD),
+        table(WEIGHTS, SCALES),
+        table(WEIGHTS, SCALES, "angle"),
+        table({**WEIGHTS, "root_pose": 0.0, "root_velocity": 0.0}, SCALES),
+        table({"pose": 0.5, "end_effector": 0.3}, SCALES),
+        table(WORLD_WEIGHTS, WORLD, "angle"),
     ],
 )
-def test_the_reference_itself_is_worth_one(body, reward: rewards.Reward) -> None:
+def test_the_reference_itself_is_worth_one(body, reward: rewards.RewardTable) -> None:
     _, reference, layout = body
     total, terms = judged(reward, layout, reference, reference, torch.zeros(len(reference)))
     np.testing.assert_allclose(total, 1, atol=1e-12)
@@ -245,28 +264,121 @@ def test_total_is_divided_by_the_weights(body) -> None:
     _, reference, layout = body
     a, b, step = reference[:10], reference[10:20], torch.zeros(10)
     double = {k: 2 * w for k, w in WEIGHTS.items()}
-    one, terms = judged(rewards.HeadingFrameReward(WEIGHTS, SCALES), layout, a, b, step)
-    np.testing.assert_allclose(one, judged(rewards.HeadingFrameReward(double, SCALES), layout, a, b, step)[0])
+    one, terms = judged(table(WEIGHTS, SCALES), layout, a, b, step)
+    np.testing.assert_allclose(one, judged(table(double, SCALES), layout, a, b, step)[0])
     np.testing.assert_allclose(one, sum(WEIGHTS[k] * v for k, v in terms.items()), rtol=1e-12)
 
 
 def test_forecasting_decays_linearly(body) -> None:
     _, reference, layout = body
     step = torch.tensor([0, 45, 90, 120])
-    reward = rewards.HeadingFrameReward(WEIGHTS, SCALES, decay_horizon=90)
+    reward = table(WEIGHTS, SCALES, decay_horizon=90)
     total, _ = judged(reward, layout, reference[:4], reference[:4], step)
     np.testing.assert_allclose(total, [1.0, 0.5, 0.0, 0.0], atol=1e-12)
 
 
-def test_bad_reward_settings_are_refused() -> None:
-    with pytest.raises(ValueError, match="weights"):
-        rewards.HeadingFrameReward({"pose": 1.0}, SCALES)
-    with pytest.raises(ValueError, match="all zero"):
-        rewards.HeadingFrameReward(dict.fromkeys(WEIGHTS, 0.0), SCALES)
+def test_terms_are_added_where_the_table_says_so(body) -> None:
+    _, reference, layout = body
+    a, b, step = reference[:10], reference[10:20], torch.zeros(10)
+    total, terms = judged(table(WEIGHTS, SCALES, combine="sum"), layout, a, b, step)
+    np.testing.assert_allclose(total, sum(WEIGHTS[k] * v for k, v in terms.items()), rtol=1e-12)
+    more = {**WEIGHTS, "centre_of_mass": 2.0}
+    summed, _ = judged(table(more, {**SCALES, **WORLD}, combine="sum"), layout, a, b, step)
+    np.testing.assert_allclose(summed - total, 2.0 * rewards.centre_of_mass(view_of(a, b, layout), scale=10.0))
+
+
+def view_of(a: TensorDict, b: TensorDict, layout: obs.BodyLayout) -> StepView:
+    return StepView(obs.BodyView(a, layout), obs.BodyView(b, layout), torch.zeros(len(a)))
+
+
+def test_a_term_that_is_absent_weighs_nothing(body) -> None:
+    _, reference, layout = body
+    a, b, step = reference[:10], reference[10:20], torch.zeros(10)
+    two = {"pose": 0.5, "end_effector": 0.3}
+    without, terms = judged(table(two, SCALES), layout, a, b, step)
+    zeros, logged = judged(table({**two, "root_pose": 0.0, "root_velocity": 0.0}, SCALES), layout, a, b, step)
+    assert torch.equal(without, zeros)
+    assert (set(terms), set(logged)) == (set(two), set(WEIGHTS))
+
+
+def test_every_term_reads_what_it_says(body) -> None:
+    """Of the reference the environment keeps no more than the attributes that terms name."""
+    _, reference, layout = body
+    body_view, whole = obs.BodyView(reference[:4], layout), obs.BodyView(reference[4:8], layout)
+    for name, term in rewards.TERMS.items():
+        if not term.function.__module__.startswith("egopose."):
+            continue
+        kept = SimpleNamespace(**{attribute: getattr(whole, attribute) for attribute in term.reads})
+        values = {**SCALES, **WORLD}[name]
+        metric = {"metric": "angle"} if name in ("pose", "root_pose", "world_pose") else {}
+        few = term.function(StepView(body_view, kept, torch.zeros(4)), **values, **metric)
+        all_of_it = term.function(StepView(body_view, whole, torch.zeros(4)), **values, **metric)
+        assert torch.equal(few, all_of_it)
+
+
+@pytest.mark.parametrize(
+    ("changed", "cause"),
+    [
+        ({"terms": {"pose": {"scale": 2.0}}}, r"terms\.pose must be \{weight"),
+        ({"terms": {"pose": {"weight": 0.0, "scale": 2.0}}}, "above 0"),
+        ({"terms": {"pose": {"weight": -1.0, "scale": 2.0}}}, r"terms\.pose\.weight must be 0 or more"),
+        ({"terms": {"pose": {"weight": 1.0}}}, r"terms\.pose\.scale is missing"),
+        ({"terms": {"pose": {"weight": 1.0, "scale": 2.0, "angle": 3}}}, r"terms\.pose\.angle is no parameter"),
+        ({"terms": {"grace": {"weight": 1.0}}}, r"terms\.grace is no reward term; there are .*pose"),
+        ({"combine": "product"}, "combine must be mean or sum"),
+    ],
+)
+def test_bad_reward_settings_are_refused(changed: dict[str, Any], cause: str) -> None:
+    good = {"combine": "mean", "rotation_metric": "angle", "terms": {"pose": {"weight": 1.0, "scale": 2.0}}}
+    with pytest.raises(ValueError, match=cause):
+        rewards.build_reward(good | changed)
+
+
+def test_a_rotation_has_one_of_two_measures() -> None:
     with pytest.raises(ValueError, match="rotation_metric"):
         rewards.rotation_distance(random_quats(1), UNTURNED, "degrees")
-    with pytest.raises(ValueError, match="kind"):
-        rewards.build_reward({"kind": "nice", "weights": WEIGHTS, "scales": SCALES})
+
+
+def test_two_terms_cannot_share_a_name() -> None:
+    with pytest.raises(ValueError, match="there is a reward term 'pose' already"):
+
+        @rewards.reward_term()
+        def pose(view: StepView) -> torch.Tensor:
+            return view.step
+
+    with pytest.raises(ValueError, match="contacts, torques, target, scene"):
+
+        @rewards.reward_term(needs=("luck",))
+        def lucky(view: StepView) -> torch.Tensor:
+            return view.step
+
+
+@pytest.mark.parametrize("name", ["estimation", "forecasting", "pose_and_end_effectors", "pose_only", "deepmimic"])
+def test_a_reward_of_an_old_run_is_todays_table(name: str) -> None:
+    """Rewards were a closed set once, under a ``kind``: what such a run directory holds is read as the table it was."""
+    today = compose_config("train", [f"reward={name}"])["reward"]
+    if name == "deepmimic":
+        former = {
+            "kind": "world_frame",
+            "weights": {"pose": 0.65, "velocity": 0.1, "end_effector": 0.15, "centre_of_mass": 0.1},
+            "scales": {"pose": 2.0, "velocity": 0.1, "end_effector": 40.0, "centre_of_mass": 10.0},
+            "rotation_metric": "angle",
+        }
+    else:
+        former = {
+            "kind": "heading_frame",
+            "weights": {term: row["weight"] for term, row in today["terms"].items()},
+            "scales": {
+                "pose": 2.0,
+                "end_effector": 20.0,
+                "root_pose": 300.0,
+                "root_linear_velocity": 1.0,
+                "root_angular_velocity": 0.1,
+            },
+            "rotation_metric": "half_angle",
+            "decay_horizon": 90 if name == "forecasting" else None,
+        }
+    assert upgraded({"reward": former})["reward"] == today
 
 
 def test_fall_is_a_head_below_the_take(body) -> None:
@@ -277,15 +389,13 @@ def test_fall_is_a_head_below_the_take(body) -> None:
     assert fallen(head, torch.full((2,), 1.5, dtype=torch.float64), 0.1).tolist() == [False, True]
 
 
-@pytest.mark.parametrize(
-    "reward", [rewards.HeadingFrameReward(WEIGHTS, SCALES), rewards.WorldFrameReward(WORLD_WEIGHTS, WORLD)]
-)
-def test_every_equation_stays_on_the_device_of_its_tensors(body, reward: rewards.Reward) -> None:
+@pytest.mark.parametrize("reward", [table(WEIGHTS, SCALES), table(WORLD_WEIGHTS, WORLD, "angle")])
+def test_every_equation_stays_on_the_device_of_its_tensors(body, reward: rewards.RewardTable) -> None:
     """On ``meta`` tensors a constant made on another device, or a value read on the host, raises."""
     _, reference, layout = body
     far = obs.BodyLayout(layout.parents.to("meta"), layout.end_effectors.to("meta"))
     view = obs.BodyView({k: v[:4].to("meta") for k, v in reference.items()}, far)
-    total, terms = reward(view, view, torch.zeros(4, device="meta"))
+    total, terms = reward(StepView(view, view, torch.zeros(4, device="meta")))
     z = view.humanoid_state
     low = fallen(view.xpos[:, 6, 2], torch.full((4,), 1.5, device="meta"), 0.1)
     assert {t.device.type for t in (total, *terms.values(), z, low)} == {"meta"}

@@ -21,13 +21,14 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from egopose.core.torch_settings import torch_threads
 from egopose.data.windows import ForecastWindow
+from egopose.envs.imitation import followed_forecasts
 from egopose.envs.mdp.observations import humanoid_state
 from egopose.envs.reference_forecasts import ReferenceForecasts
 from egopose.envs.test_time import prepare_for_test
 from egopose.evaluation import forecast_run as forecast_evaluation
 from egopose.evaluation.forecast_run import ForecastSettings, forecast_windows_of
 from egopose.inference.forecaster import forecast
-from egopose.inference.planner import Planner, followed_forecasts
+from egopose.inference.planner import Planner
 from egopose.inference.planner_settings import PlannerSettings
 from egopose.pipeline.agent import Agent
 from egopose.pipeline.environment import build_env
@@ -82,8 +83,7 @@ def planner_for(agent: Agent, windows: list[ForecastWindow], **changed: Any) -> 
     chosen = settings(**{**SMALL, **changed})
     assert agent.dataset.forecasts is not None
     env = agent.make_env(num_envs=len(windows) * chosen.samples, fragments=windows, **TEST)
-    followed, row = followed_forecasts(agent.dataset.forecasts, nows(agent, windows))
-    return Planner(env, agent.actor, agent.critic, followed, chosen, row)
+    return Planner(env, agent.actor, agent.critic, chosen, env.base_env.problem.followed(nows(agent, windows)))
 
 
 def forecast_of(agent: Agent, windows: list[ForecastWindow], samples: int = 1, planner: Any = None) -> Any:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from env_stand_in import environment, group
+from env_stand_in import build_problem, environment, group
 from humanoid_stand_in import StandIn, reference_motion, stand_in
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
@@ -20,10 +20,10 @@ from torchrl.envs import Compose, TransformedEnv
 from egopose.core.config import compose_config
 from egopose.core.errors import InputError
 from egopose.core.torch_settings import enable_onednn_matmul
-from egopose.envs.build import build_problem
 from egopose.envs.env import EgoPoseEnv
 from egopose.envs.forecasting_transforms import RecurrentStates
 from egopose.envs.mdp.observations import humanoid_state
+from egopose.envs.problem import Followed, global_frame
 from egopose.envs.starts import Piece
 from egopose.envs.transforms import StateNormalizer
 from egopose.evaluation.agents import estimate_and_judge
@@ -115,7 +115,7 @@ def planner_for(
 ) -> Planner:
     chosen = settings(**{**SMALL, **changed})
     copies = frozen(make_env(num_envs * chosen.samples, **(env or {})))
-    return Planner(copies, policy or actor(), critic(), states, chosen)
+    return Planner(copies, policy or actor(), critic(), chosen, Followed(states, global_frame))
 
 
 def leaning(env: TransformedEnv, steps: int = 3) -> EgoPoseEnv:
@@ -527,7 +527,7 @@ def test_what_cannot_be_planned_for_is_refused() -> None:
     env = make_env(12)
     env.append_transform(RecurrentStates({"hidden": 4}))
     with pytest.raises(InputError, match=r"model\.memory"):
-        Planner(env, actor(), critic(), states, settings(**SMALL))
+        Planner(env, actor(), critic(), settings(**SMALL), Followed(states, global_frame))
 
 
 def estimated_by(planner: PlannerSettings | None, made: Callable[[], None] = lambda: None) -> list[Estimate]:

@@ -9,7 +9,7 @@ import torch
 
 from egopose.core.config import compose_config
 from egopose.data.preparation import humanoid_of
-from egopose.envs.problem import ActionSettings
+from egopose.envs.imitation import ActionSettings
 from egopose.humanoid.torques import torque_driven
 from egopose.training.adversarial import AdversarialPPO, Discriminator, DiscriminatorSettings
 

@@ -201,8 +201,10 @@ def test_the_reward_decays_with_time() -> None:
     plain = problem()
     frame = torch.arange(10, 19)
     state = given.reference_at(frame)
-    decayed, _ = given.rewards(state, frame, torch.tensor([0, 9, 18, 30, 45, 60, 81, 90, 95]))
-    assert torch.allclose(plain.rewards(state, frame, torch.zeros(9))[0], torch.ones(9, dtype=torch.float64))
+    decayed, _ = given.rewards(given.step_view(state, frame, torch.tensor([0, 9, 18, 30, 45, 60, 81, 90, 95])))
+    assert torch.allclose(
+        plain.rewards(plain.step_view(state, frame, torch.zeros(9)))[0], torch.ones(9, dtype=torch.float64)
+    )
     wanted = torch.tensor([1, 0.9, 0.8, 2 / 3, 0.5, 1 / 3, 0.1, 0, 0], dtype=torch.float64)
     torch.testing.assert_close(decayed, wanted)
 

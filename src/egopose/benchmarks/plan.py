@@ -11,7 +11,6 @@ import torch
 
 from egopose.benchmarks.raw_replay import RawReplay, StepRecorder
 from egopose.core.config import compose_config
-from egopose.envs.mdp.observations import humanoid_state
 from egopose.envs.test_time import prepare_for_test
 from egopose.inference.planner import Planner
 from egopose.inference.planner_settings import planner_settings
@@ -51,8 +50,7 @@ def run(overrides: Sequence[str], rounds: int) -> dict[str, Any]:
     for one in (env, copies):
         prepare_for_test(one, actor, critic)
     env.reset()
-    states = humanoid_state(dataset.reference).float()
-    planner = Planner(copies, actor, critic, states, settings)
+    planner = Planner(copies, actor, critic, settings)
     base, physics = env.base_env, copies.base_env.physics
     recorder, replay = StepRecorder(physics), RawReplay(physics)
 

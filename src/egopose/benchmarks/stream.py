@@ -36,6 +36,7 @@ from egopose.models.regressor_settings import RegressorSettings
 from egopose.pipeline.environment import build_env
 from egopose.pipeline.networks import build_networks
 from egopose.pipeline.regressor_input import planes_of
+from egopose.tasks.task import task_of
 from egopose.training.regressor import build_regressor
 from egopose.vision.encoders import build_encoder
 
@@ -205,7 +206,7 @@ def untrained_forecaster(values: Mapping[str, Any], trained: Trained) -> Forecas
     settings = forecast_settings(values)
     config = compose_config("train", ["experiment=forecasting"])
     config = {**config, **{group: trained.config[group] for group in ("sim", "humanoid")}}
-    frames = config["task"]["context"] + config["task"]["minimum"]
+    frames = (task_of(config).context(config) or 0) + int(config["task"]["minimum"])
     dataset = still_frames(trained.humanoid, trained.regressor, trained.source_config, frames)
     worlds = 1 + settings.drawn
     env = build_env(config, dataset, "test", num_envs=worlds, whole_fragments=True, falls_end=False)

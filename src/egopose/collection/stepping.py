@@ -121,7 +121,7 @@ class TransformedEgoPoseEnv(TransformedEnv):
         rows = done.squeeze(-1).nonzero().squeeze(-1)
         base = self.base_env
         fresh = self.transform._reset(Entries(), Entries(base.begin(rows + (worlds.start or 0))))
-        changed = base.ongoing(after["fallen"] & ~done, worlds)
+        changed = base.ongoing(after, worlds)
         for key, value in fresh.leaves():
             # A hidden state is missing where the actions came from elsewhere.
             if key not in changed and (before := after.get(key, None)) is not None:

@@ -25,7 +25,7 @@ RENAMED = {
     "planner.knot": "planner.knot_spacing",
 }
 #: Settings without a successor: what they asked for is gone.
-REMOVED = ("training.evaluate_async",)
+REMOVED = ("training.evaluate_async", "aids")
 #: Dotted name -> {former value: present one}.
 VALUES: dict[str, dict[Any, Any]] = {"regressor.kernel.body_parts": {"limbs": "body_parts"}}
 
@@ -42,11 +42,31 @@ def upgraded(config: Mapping[str, Any]) -> dict[str, Any]:
         parent, name = _parent(out, gone)
         if parent is not None:
             parent.pop(name, None)
+    if isinstance(out.get("reward"), dict) and "kind" in out["reward"]:
+        out["reward"] = _reward_table(out["reward"])
     for field, values in VALUES.items():
         parent, name = _parent(out, field)
         if parent is not None and parent.get(name) in values:
             parent[name] = values[parent[name]]
     return out
+
+
+def _reward_table(former: Mapping[str, Any]) -> dict[str, Any]:
+    """A reward of a closed set of terms, ``kind`` ``heading_frame`` or ``world_frame``, as a table of terms."""
+    world = former["kind"] == "world_frame"
+    names = {"pose": "world_pose", "velocity": "joint_velocity", "end_effector": "world_end_effector"} if world else {}
+    scales, terms = former["scales"], {}
+    for term, weight in former["weights"].items():
+        row = {"weight": weight, "scale": scales.get(term, scales.get("root_linear_velocity"))}
+        if term == "root_velocity":
+            row["angular_scale"] = scales["root_angular_velocity"]
+        terms[names.get(term, term)] = row
+    return {
+        "combine": "mean",
+        "rotation_metric": former["rotation_metric"],
+        "decay_horizon": former.get("decay_horizon"),
+        "terms": terms,
+    }
 
 
 def _parent(config: dict[str, Any], field: str) -> tuple[dict[str, Any] | None, str]:

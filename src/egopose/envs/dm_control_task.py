@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from tensordict import TensorDict
 from torch import Tensor
 
-from egopose.envs.problem import ImitationProblem
+from egopose.envs.problem import Problem
 from egopose.envs.starts import Starts
 
 
@@ -52,10 +52,10 @@ class HumanoidPhysics(dm_mujoco.Physics):
 
 
 class EgoPoseTask(control.Task):
-    """State, reward and termination of :class:`ImitationProblem` for ``dm_control.rl.control.Environment``.
+    """State, reward and termination of a task's problem for ``dm_control.rl.control.Environment``.
 
-    Observations: ``humanoid_state [115]`` float64 and ``frame [1]`` int64. The last time step has discount 0 after a
-    fall or diverged physics and 1 at the end of the fragment or horizon.
+    Observations: the problem's (``humanoid_state [115]`` of imitation), float64, and ``frame [1]`` int64. The last time
+    step has discount 0 after an ending or diverged physics and 1 at the end of the fragment or horizon.
 
     Args:
         problem: humanoid, reference, reward, action and termination.
@@ -63,7 +63,7 @@ class EgoPoseTask(control.Task):
         seed: of the starts.
     """
 
-    def __init__(self, problem: ImitationProblem, starts: Starts, seed: int = 0) -> None:
+    def __init__(self, problem: Problem, starts: Starts, seed: int = 0) -> None:
         self.problem, self.starts = problem, starts
         self._generator = torch.Generator().manual_seed(seed)
         self._take, self._start, self._stop, self._frame = (torch.zeros(1, dtype=torch.int64) for _ in range(4))
@@ -74,10 +74,9 @@ class EgoPoseTask(control.Task):
         episode = self.starts(torch.zeros(1, dtype=torch.int64), self._generator)
         self._take, self._start, self._stop = episode.take, episode.start, episode.stop
         self._frame = episode.start
-        reference = self.problem.reference_at(self._frame)
-        physics.data.qpos[:] = reference["qpos"][0].numpy()
-        physics.data.qvel[:] = reference["qvel"][0].numpy()
-        self._placed = reference["qpos"][:, 7:]
+        qpos, qvel = self.problem.first_state(self._frame)
+        physics.data.qpos[:], physics.data.qvel[:] = qpos[0].numpy(), qvel[0].numpy()
+        self._placed = qpos[:, 7:]
         physics.diverged = False
 
     def before_step(self, action: NDArray[np.floating] | Tensor, physics: HumanoidPhysics) -> None:
@@ -91,16 +90,18 @@ class EgoPoseTask(control.Task):
 
     def get_observation(self, physics: HumanoidPhysics) -> OrderedDict[str, NDArray[Any]]:
         state = self._body_state(physics)
-        return OrderedDict(humanoid_state=self.problem.observation(state)[0].numpy(), frame=self._frame.numpy().copy())
+        seen = {key: value[0].numpy() for key, value in self.problem.observations(state, self._frame).items()}
+        return OrderedDict(**seen, frame=self._frame.numpy().copy())
 
     def get_reward(self, physics: HumanoidPhysics) -> float:
-        reward, terms = self.problem.rewards(self._body_state(physics), self._frame, self._frame - self._start)
+        view = self.problem.step_view(self._body_state(physics), self._frame, self._frame - self._start)
+        reward, terms = self.problem.rewards(view)
         self.reward_terms = {k: 0.0 if physics.diverged else float(v) for k, v in terms.items()}
         return 0.0 if physics.diverged else float(reward)
 
     def get_termination(self, physics: HumanoidPhysics) -> float | None:
-        fallen = bool(self.problem.fallen(self._body_state(physics), self._take))
-        if physics.diverged or (fallen and self.problem.termination.enabled):
+        endings = self.problem.ended(self._body_state(physics), self._take)
+        if physics.diverged or any(bool(endings[name]) for name in self.problem.ends_episode):
             return 0.0
         return 1.0 if bool(self._frame >= self._stop - 1) else None
 
@@ -118,7 +119,7 @@ class EgoPoseTask(control.Task):
         return TensorDict({k: torch.from_numpy(np.asarray(v))[None] for k, v in arrays.items()}, batch_size=[1])
 
 
-def load_environment(problem: ImitationProblem, starts: Starts, seed: int = 0) -> dm_env.Environment:
+def load_environment(problem: Problem, starts: Starts, seed: int = 0) -> dm_env.Environment:
     """One world as a dm_env, ready for ``dm_control.viewer.launch`` or TorchRL's ``DMControlWrapper``."""
     # A copy: dm_control switches actuation off and on in the model while it resets.
     physics = HumanoidPhysics.from_model(wrapper.MjModel(copy.copy(problem.humanoid.mj_model)))

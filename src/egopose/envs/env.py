@@ -1,7 +1,8 @@
-"""The batched environment: N humanoids imitating N pieces of reference motion, as one TorchRL ``EnvBase``."""
+"""The batched environment: N humanoids on N pieces of a task's reference, as one TorchRL ``EnvBase``."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -13,12 +14,10 @@ from torch import Tensor
 from torchrl.data import Binary, Composite, Unbounded
 from torchrl.envs import EnvBase
 
-from egopose.envs.aids import Aids, ramp
-from egopose.envs.assist import RootAssistance
 from egopose.envs.mdp.observations import BodyState, BodyView
-from egopose.envs.problem import ImitationProblem
-from egopose.envs.starts import AdaptiveStarts, Starts
-from egopose.humanoid.physics import ALL, Array, BatchedPhysics
+from egopose.envs.problem import BODY_KEYS, Problem
+from egopose.envs.starts import Starts
+from egopose.humanoid.physics import ALL, Array, BatchedPhysics, Indices
 
 Counter = NDArray[np.int64]
 
@@ -48,9 +47,33 @@ def _replaced(counter: Counter, rows: NDArray[np.integer] | slice, values: Count
     return counter
 
 
-def _no_flags(size: torch.Size) -> dict[str, Tensor]:
-    names = ("fallen", "diverged", "done", "terminated", "truncated")
+_DONE = ("done", "terminated", "truncated")
+
+
+def _no_flags(endings: tuple[str, ...], size: torch.Size) -> dict[str, Tensor]:
+    names = (*endings, "diverged", *_DONE)
     return dict(zip(names, torch.zeros(len(names), *size, 1, dtype=torch.bool).unbind(), strict=True))
+
+
+class _Lazily(Mapping[str, Tensor]):
+    """The body state of some worlds, whose places are worked out only where they are asked for."""
+
+    def __init__(self, physics: BatchedPhysics, rows: Indices) -> None:
+        self._physics, self._rows = physics, rows
+        self._whole: dict[str, Array] | None = None
+
+    def __getitem__(self, key: str) -> Tensor:
+        if key in ("qpos", "qvel"):  # indexing by a slice would give a view of what the next step changes
+            return torch.from_numpy(np.array(getattr(self._physics, key)[self._rows]))
+        if self._whole is None:
+            self._whole = {name: value[self._rows] for name, value in self._physics.body_state().items()}
+        return torch.from_numpy(self._whole[key])
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(BODY_KEYS)
+
+    def __len__(self) -> int:
+        return len(BODY_KEYS)
 
 
 class EgoPoseEnv(EnvBase):
@@ -59,23 +82,22 @@ class EgoPoseEnv(EnvBase):
     Time: a reset puts a world on reference frame s. A step applies the action (the PD target for frame s + 1), runs the
     physics to s + 1 and rewards the state there against the reference there.
 
-    Keys: ``humanoid_state [115]`` float32 (raw); int64 ``frame [1]`` (global reference frame), ``episode_start [1]``
-    (global), ``episode_stop [1]`` (global, exclusive), ``episode_step [1]``; ``reward_terms`` (nested, ``[1]`` each);
-    ``fallen [1]`` and ``diverged [1]`` bool; ``action [52]``; ``reward``; ``terminated`` (fall, diverged physics),
+    Keys: the problem's observations, float32 and raw (``humanoid_state [115]`` of imitation); int64 ``frame [1]``
+    (global reference frame), ``episode_start [1]`` (global), ``episode_stop [1]`` (global, exclusive), ``episode_step
+    [1]``; ``reward_terms`` (nested, ``[1]`` each); the problem's endings (``fallen [1]``) and ``diverged [1]``, bool;
+    ``action [52]``; ``reward``; ``terminated`` (an ending of the problem that ends the episode, diverged physics),
     ``truncated`` (horizon or end of the fragment), ``done``.
 
     A reset may bring its own first state: ``initial_qpos [N, 59]`` and ``initial_qvel [N, 58]`` in the reset's
     TensorDict, read at the worlds being reset.
 
     Args:
-        problem: humanoid, reference, reward, action and termination.
+        problem: the task, see :class:`~egopose.envs.problem.Problem`.
         num_envs: N.
         starts: deals episodes.
         threads: of the physics.
         seed: of the starts.
         dump_dir: where diverged worlds leave their last states.
-        aids: of training, see :mod:`egopose.envs.aids`; None for none.
-        workers: environments like this one that a run collects in: the aids' time goes by in all of them.
 
     A collector need not know a reward to act on: after :meth:`make_rewards_lazy` it asks for those of a batch at once.
 
@@ -85,15 +107,13 @@ class EgoPoseEnv(EnvBase):
 
     def __init__(
         self,
-        problem: ImitationProblem,
+        problem: Problem,
         num_envs: int,
         starts: Starts,
         *,
         threads: int = 1,
         seed: int = 0,
         dump_dir: str | Path | None = None,
-        aids: Aids | None = None,
-        workers: int = 1,
     ) -> None:
         super().__init__(device=None, batch_size=torch.Size([num_envs]))
         humanoid = problem.humanoid
@@ -106,10 +126,6 @@ class EgoPoseEnv(EnvBase):
             body_ids=humanoid.body_ids,
             dump_dir=dump_dir,
         )
-        self._falls = None if aids is None else aids.falls
-        assist = None if aids is None else aids.assist
-        self._assistance = None if assist is None else RootAssistance(assist, problem.reference)
-        self._workers = workers
         self._generator = torch.Generator().manual_seed(seed)
         # Arrays, as everything that is worked out for the few worlds of a step but what is put in entries: an operator
         # of torch costs several times as much.
@@ -117,7 +133,7 @@ class EgoPoseEnv(EnvBase):
         self.placed = torch.zeros(num_envs, humanoid.mj_model.nu, dtype=torch.float64)
         self._unrewarded: list[_Unrewarded] | None = None
         self._earnings: list[Tensor] = []
-        self._no_flags = _no_flags(self.batch_size)
+        self._no_flags = _no_flags(problem.endings, self.batch_size)
         self._unknown_reward = torch.full((num_envs, 1), torch.nan)
         self._make_specs()
 
@@ -126,20 +142,19 @@ class EgoPoseEnv(EnvBase):
         model = self.problem.humanoid.mj_model
         whole, flag = Unbounded((n, 1), dtype=torch.int64), Binary(1, (n, 1), dtype=torch.bool)
         self.observation_spec = Composite(
-            humanoid_state=Unbounded((n, 2 * model.nq - 3), dtype=torch.float32),
+            **{k: Unbounded((n, size), dtype=torch.float32) for k, size in self.problem.observation_sizes.items()},
             frame=whole.clone(),
             episode_start=whole.clone(),
             episode_stop=whole.clone(),
             episode_step=whole.clone(),
             **self._terms_spec(),
-            fallen=flag.clone(),
-            diverged=flag.clone(),
+            **{name: flag.clone() for name in (*self.problem.endings, "diverged")},
             shape=(n,),
         )
         self.action_spec = Unbounded((n, model.nu), dtype=torch.float32)
         self.reward_spec = Unbounded((n, 1), dtype=torch.float32)
         self.done_spec = Composite(
-            {k: flag.clone() for k in ("done", "terminated", "truncated")},
+            {k: flag.clone() for k in _DONE},
             shape=(n,),
         )
 
@@ -179,7 +194,7 @@ class EgoPoseEnv(EnvBase):
 
     def _earned(self, state: BodyState | BodyView, frame: Tensor, step: Tensor, diverged: Tensor) -> Tensor:
         """Reward and terms ``[n, 1 + K]`` float32 at global frames ``[n]``; a diverged world earns nothing."""
-        reward, terms = self.problem.rewards(state, frame, step)
+        reward, terms = self.problem.rewards(self.problem.step_view(state, frame, step))
         return (torch.stack([reward, *terms.values()], dim=-1) * ~diverged[:, None]).float()
 
     @property
@@ -239,7 +254,7 @@ class EgoPoseEnv(EnvBase):
 
     def _put(self, worlds: Tensor, qpos: Tensor, qvel: Tensor) -> None:
         self.physics.set_state(worlds.numpy(), qpos.double().numpy(), qvel.double().numpy())
-        if self.problem.action.reference == "start":
+        if self.problem.remembers_start:
             self.placed[worlds] = qpos[:, 7:].double()
 
     def observe(self, worlds: Tensor | slice = ALL) -> TensorDict:
@@ -248,21 +263,24 @@ class EgoPoseEnv(EnvBase):
         return TensorDict(entries, batch_size=entries["done"].shape[:1])
 
     def _observed(self, worlds: Tensor | slice) -> dict[str, Any]:
-        # The state z needs no kinematics, and concatenating makes a copy of it.
         rows = worlds if isinstance(worlds, slice) else worlds.numpy()
-        qpos, qvel = self.physics.qpos[rows], self.physics.qvel[rows]
-        z = self.problem.observation({"qpos": torch.from_numpy(qpos), "qvel": torch.from_numpy(qvel)}).float()
+        clock = self._clock(rows)
+        frame = clock["frame"].squeeze(-1)
         return {
-            **self._clock(rows),
-            "humanoid_state": z,
-            **self._terms(torch.zeros(len(z), len(self.problem.reward.names))),
-            **_no_flags(z.shape[:1]),
+            **clock,
+            **self._observations(_Lazily(self.physics, rows), frame),
+            **self._terms(torch.zeros(len(frame), len(self.problem.reward.names))),
+            **_no_flags(self.problem.endings, frame.shape),
         }
 
-    def ongoing(self, fallen: Tensor, worlds: slice = ALL) -> dict[str, Tensor]:
-        """Counters and flags of ``worlds`` where those that were done have begun anew; ``fallen`` ``[n, 1]`` before."""
+    def _observations(self, state: BodyState | BodyView, frame: Tensor) -> dict[str, Tensor]:
+        return {key: value.float() for key, value in self.problem.observations(state, frame).items()}
+
+    def ongoing(self, after: Mapping[Any, Any], worlds: slice = ALL) -> dict[str, Tensor]:
+        """Counters and flags of ``worlds``, entries ``after`` a step, where those that are done have begun anew."""
         flags = {name: flag[worlds] for name, flag in self._no_flags.items()}
-        return {**self._clock(worlds), **flags, "fallen": fallen}
+        going_on = {name: after[name] & ~after["done"] for name in self.problem.endings}
+        return {**self._clock(worlds), **flags, **going_on}
 
     def _terms(self, columns: Tensor) -> dict[str, TensorDict]:
         """``reward_terms`` of ``[n, K]``, unless they are deferred."""
@@ -277,7 +295,7 @@ class EgoPoseEnv(EnvBase):
         return {name: torch.from_numpy(counter) for name, counter in clock.items()}
 
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
-        stopped = self.physics.step(self._target(tensordict["action"], ALL), self._wrench(ALL))
+        stopped = self.physics.step(self._target(tensordict["action"], ALL))
         return TensorDict(self._arrived(stopped, ALL), batch_size=self.batch_size)
 
     def try_step(self, action: Tensor) -> tuple[BodyView, dict[str, Tensor]]:
@@ -286,16 +304,16 @@ class EgoPoseEnv(EnvBase):
         Returns:
             The bodies, and the entries of their observations.
         """
-        stopped = self.physics.step(self._target(action, ALL), self._wrench(ALL))
+        stopped = self.physics.step(self._target(action, ALL))
         body = self.problem.view({k: torch.from_numpy(v) for k, v in self.physics.body_state().items()})
-        state = self.problem.observation(body).float()
-        diverged = torch.from_numpy(stopped[:, None])
-        return body, {**self._clock(), **self._no_flags, "diverged": diverged, "humanoid_state": state}
+        clock, diverged = self._clock(), torch.from_numpy(stopped[:, None])
+        seen = self._observations(body, clock["frame"].squeeze(-1))
+        return body, {**clock, **self._no_flags, "diverged": diverged, **seen}
 
     def begin_step(self, action: Tensor, worlds: slice) -> None:
         """Have the physics' threads take a step of ``worlds``, a range, under ``action [n, A]``, while the caller works
         for others."""
-        self.physics.begin_step(self._target(action, worlds), worlds, self._wrench(worlds))
+        self.physics.begin_step(self._target(action, worlds), worlds)
 
     def end_step(self, worlds: slice) -> dict[str, Any]:
         """Wait for what :meth:`begin_step` began; the entries that a step of these worlds alone would have returned.
@@ -311,36 +329,21 @@ class EgoPoseEnv(EnvBase):
         self._frame = _replaced(self._frame, worlds, frame)
         return self.problem.target(action.detach(), torch.from_numpy(frame), self.placed[worlds]).numpy()
 
-    def _wrench(self, worlds: slice) -> Array | None:
-        """On the roots of ``worlds``, towards the frames that :meth:`_target` has set; None without assistance."""
-        if self._assistance is None:
-            return None
-        now = {k: torch.from_numpy(v[worlds]) for k, v in (("qpos", self.physics.qpos), ("qvel", self.physics.qvel))}
-        return self._assistance.wrench(now, torch.from_numpy(self._frame[worlds]), self._taken(worlds)).numpy()
-
-    def _taken(self, worlds: slice) -> Tensor:
-        """``[n]`` control steps that all worlds of the run have taken, when all have as many as each of these."""
-        return torch.from_numpy(self.physics.taken[worlds]) * self.batch_size[0] * self._workers
-
-    def _head_drop(self, worlds: slice) -> Tensor | None:
-        if self._falls is None:
-            return None
-        return ramp(self._falls.head_drop, self.problem.termination.head_drop, self._falls.steps, self._taken(worlds))
-
     def _arrived(self, stopped: NDArray[np.bool_], worlds: slice) -> dict[str, Any]:
         body = {k: torch.from_numpy(v) for k, v in self.physics.body_state(worlds).items()}
         state = self.problem.view(body)
-        take = torch.from_numpy(self._take[worlds])
-        fallen = self.problem.fallen(state, take, self._head_drop(worlds)).numpy()
-        terminated = stopped | fallen if self.problem.termination.enabled else stopped
+        endings = self.problem.ended(state, torch.from_numpy(self._take[worlds]))
+        terminated = stopped
+        for name in self.problem.ends_episode:
+            terminated = terminated | endings[name].numpy()
         truncated = (self._frame[worlds] >= self._stop[worlds] - 1) & ~terminated
         done = terminated | truncated
         clock = self._clock(worlds)
         frame, steps = clock["frame"].squeeze(-1), clock["episode_step"].squeeze(-1)
-        if isinstance(self.starts, AdaptiveStarts) and done.any():
-            ended = torch.from_numpy(done)
+        if done.any():
+            rows = torch.from_numpy(done)
             start = torch.from_numpy(self._start[worlds])
-            self.starts.ended(start[ended], steps[ended], torch.from_numpy(terminated)[ended])
+            self.starts.ended(start[rows], steps[rows], torch.from_numpy(terminated)[rows])
         diverged = torch.from_numpy(stopped)
         if self._unrewarded is None:
             earned = self._earned(state, frame, steps, diverged)
@@ -351,12 +354,13 @@ class EgoPoseEnv(EnvBase):
             if len(self._unrewarded) * len(stopped) >= _STEPS_REWARDED_AT_ONCE * self.batch_size[0]:
                 self._reward_waiting()
             reward, terms = self._unknown_reward[worlds], {}
-        flags = {"fallen": fallen, "diverged": stopped, "terminated": terminated, "truncated": truncated, "done": done}
+        flags = {"diverged": stopped, "terminated": terminated, "truncated": truncated, "done": done}
         return {
             **clock,
-            "humanoid_state": self.problem.observation(state).float(),
+            **self._observations(state, frame),
             "reward": reward,
             **terms,
+            **{name: flag[:, None] for name, flag in endings.items()},
             **{name: torch.from_numpy(flag[:, None]) for name, flag in flags.items()},
         }
 
@@ -369,8 +373,8 @@ class EgoPoseEnv(EnvBase):
             "start": torch.from_numpy(self._start.copy()),
             "stop": torch.from_numpy(self._stop.copy()),
             "frame": torch.from_numpy(self._frame.copy()),
-            **({"placed": self.placed.clone()} if self.problem.action.reference == "start" else {}),
-            **({"survived": self.starts.survived.clone()} if isinstance(self.starts, AdaptiveStarts) else {}),
+            **({"placed": self.placed.clone()} if self.problem.remembers_start else {}),
+            **self.starts.state_dict(),
         }
 
     def load_state_dict(self, state_dict: dict[str, Tensor], *args: Any, **kwargs: Any) -> None:
@@ -384,10 +388,9 @@ class EgoPoseEnv(EnvBase):
         self._take, self._start, self._stop, self._frame = (
             state_dict[k].numpy().copy() for k in ("take", "start", "stop", "frame")
         )
-        if self.problem.action.reference == "start":
+        if self.problem.remembers_start:
             self.placed = state_dict["placed"].clone()
-        if isinstance(self.starts, AdaptiveStarts):
-            self.starts.survived = state_dict["survived"].clone()
+        self.starts.load_state_dict(state_dict)
 
     def close(self, *, raise_if_closed: bool = True) -> None:
         self.physics.close()

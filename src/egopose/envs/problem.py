@@ -2,21 +2,39 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from types import SimpleNamespace
+from typing import Any, NamedTuple, Protocol
 
 import torch
-from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
-from egopose.envs.mdp import terminations
-from egopose.envs.mdp.observations import BodyLayout, BodyState, BodyView, humanoid_state_rows
-from egopose.envs.mdp.rewards import Reward
-from egopose.envs.reference_forecasts import ReferenceForecasts
+from egopose.envs.mdp.observations import BodyState, BodyView
+from egopose.envs.mdp.rewards import RewardTable
+from egopose.envs.mdp.step_view import StepView
 from egopose.humanoid.model import HumanoidModel
-from egopose.humanoid.torques import torque_driven
 
+#: Of a body state, batch ``[N]``, float64: see docs/architecture.md.
 BODY_KEYS = ("qpos", "qvel", "xpos", "xquat", "com")
+#: Of what an environment writes: which row of what is followed each body should be in, ``[N]`` int64.
+Rows = Callable[[Mapping[str, Tensor]], Tensor]
+
+
+class Followed(NamedTuple):
+    """What bodies follow at test time, where the truth is not known.
+
+    Attributes:
+        states: ``[R, 2 nq - 3]`` humanoid states.
+        row: which of them each body should be in now.
+    """
+
+    states: Tensor
+    row: Rows
+
+
+def global_frame(entries: Mapping[str, Tensor]) -> Tensor:
+    """The row of a table of all frames."""
+    return entries["frame"].squeeze(-1)
 
 
 @dataclass(frozen=True)
@@ -40,181 +58,57 @@ class TakeTable:
         return torch.minimum(frames + 1, last)
 
 
-@dataclass(frozen=True)
-class ActionSettings:
-    """What an action is added to.
+class Problem(Protocol):
+    """What an environment asks of a task: the one definition that every environment of it shares.
 
-    Args:
-        reference: ``rest``: the rest pose (the paper); ``regressor``: a table of joint targets, one row a frame;
-            ``start``: the joint angles the body was placed with, as a reset or an estimated state put it there.
-        scale: of the action, rad per unit.
-        velocity_feedforward: with ``regressor``, kd/kp times the table's joint velocity times this is added to the
-            target, against the lag of a PD controller.
-        smoothing: s, standard deviation in time of a Gaussian over what the regressor saw (joint targets, states,
-            context) before it is followed; at most a third of a second either side counts.
-        kind: ``pd``: actions move the targets of PD controllers; ``torque``: they are torques, a unit being the joint's
-            limit times ``scale``, and the other settings are not read.
-        joint_damping: with ``torque``, see :func:`egopose.humanoid.torques.torque_driven`.
+    Attributes:
+        humanoid: compiled at the simulation's rate.
+        takes: where episodes lie among the reference's frames.
+        reward: the table of terms.
+        observation_sizes: key -> numbers, of what :meth:`observations` gives.
+        endings: names of what :meth:`ended` gives.
+        ends_episode: those of them that end an episode.
+        remembers_start: whether targets depend on the joint angles a body was placed with.
+        actions_move_targets: whether an action is added to PD targets; False where it is a torque.
     """
 
-    reference: str = "rest"
-    scale: float = 1.0
-    velocity_feedforward: float = 0.0
-    smoothing: float = 0.0
-    kind: str = "pd"
-    joint_damping: float = 0.0
-
-    def __post_init__(self) -> None:
-        if self.reference not in ("rest", "regressor", "start"):
-            raise ValueError(f"action.reference must be rest, regressor or start, not {self.reference!r}")
-        if not 0.0 <= self.smoothing <= 1.0:
-            raise ValueError(f"action.smoothing must lie in 0..1 s, not {self.smoothing}")
-        if self.kind not in ("pd", "torque"):
-            raise ValueError(f"action.kind must be pd or torque, not {self.kind!r}")
-
-
-@dataclass(frozen=True)
-class TerminationSettings:
-    """When a fall ends the episode.
-
-    Args:
-        enabled: off in evaluation, where the fail-safe answers a fall.
-        head_drop: m below the take's lowest reference head height.
-    """
-
-    enabled: bool = True
-    head_drop: float = 0.1
-
-
-class ImitationProblem:
-    """State, reward, termination and PD targets as functions of body states and frames.
-
-    Args:
-        humanoid: the model.
-        reference: TensorDict ``[F]`` of body states (float64), all takes one after the other.
-        takes: where they lie.
-        reward: see :mod:`egopose.envs.mdp.rewards`.
-        action, termination: settings.
-        action_reference: ``[F, nu]`` rad, the base target for reaching each frame; needed by ``regressor``.
-        forecasts: kinematic forecasts: episodes begin in their first states in place of the reference's.
-
-    Raises:
-        ValueError: the reference does not fit the humanoid, or the action's table is missing or of another shape.
-    """
-
-    def __init__(
-        self,
-        humanoid: HumanoidModel,
-        reference: TensorDictBase,
-        takes: TakeTable,
-        reward: Reward,
-        action: ActionSettings,
-        termination: TerminationSettings,
-        action_reference: Tensor | None = None,
-        forecasts: ReferenceForecasts | None = None,
-    ) -> None:
-        if action.kind == "torque":
-            humanoid = torque_driven(humanoid, action.joint_damping)
-        model = humanoid.mj_model
-        if reference["qpos"].shape[1:] != (model.nq,) or reference["qvel"].shape[1:] != (model.nv,):
-            raise ValueError(
-                f"reference qpos and qvel have {reference['qpos'].shape[-1]} and {reference['qvel'].shape[-1]} "
-                f"columns, the humanoid {model.nq} and {model.nv}"
-            )
-        if reference["xpos"].shape[1] != len(humanoid.body_ids):
-            raise ValueError(
-                f"reference has {reference['xpos'].shape[1]} bodies, the humanoid {len(humanoid.body_ids)}"
-            )
-        self.humanoid, self.takes, self.reward = humanoid, takes, reward
-        self.action, self.termination, self.forecasts = action, termination, forecasts
-        self.n_frames = reference.shape[0]
-        self.reference = reference
-        self.layout = BodyLayout(
-            torch.as_tensor(humanoid.joint_parent, dtype=torch.int64),
-            torch.as_tensor(humanoid.end_effectors, dtype=torch.int64),
-        )
-        # Plain tensors of what is looked up at every step or reset; what the reward reads of the reference is worked
-        # out once.
-        whole = BodyView(self.reference_at(torch.arange(self.n_frames)), self.layout)
-        self._qpos, self._qvel = whole.qpos, whole.qvel
-        self._rewarded = {name: getattr(whole, name).contiguous() for name in reward.reads}
-        self._range = torch.as_tensor(humanoid.joint_range, dtype=torch.float64).T
-        self._rest = torch.as_tensor(humanoid.rest_action, dtype=torch.float64)
-        self._table: Tensor | None = None
-        if action.reference == "regressor":
-            if action_reference is None or action_reference.shape != (self.n_frames, model.nu):
-                got = "none" if action_reference is None else list(action_reference.shape)
-                raise ValueError(
-                    f"action.reference=regressor needs joint targets [{self.n_frames}, {model.nu}], got {got}"
-                )
-            self.read_actions_from(action_reference)
-
-    def read_actions_from(self, action_reference: Tensor) -> None:
-        """Take ``[F, nu]`` rad for the joint angles that actions are added to. A live stream knows two at a time."""
-        lag = torch.as_tensor(self.humanoid.kd / self.humanoid.kp) * self.action.velocity_feedforward
-        table = torch.as_tensor(action_reference).to(torch.float64)
-        self._table = table + lag * self._table_velocity(table)
-
-    def _table_velocity(self, table: Tensor) -> Tensor:
-        """``[F, nu]`` rad/s by which each frame is reached from the one before, within its take."""
-        velocity = torch.zeros_like(table)
-        velocity[1:] = table.diff(dim=0) / self.humanoid.control_dt
-        for offset, length in zip(self.takes.offsets.tolist(), self.takes.lengths.tolist(), strict=True):
-            velocity[offset] = velocity[offset + 1] if length > 1 else 0.0
-        return velocity
-
-    def reference_at(self, frame: Tensor) -> TensorDict:
-        """Body states ``[N]`` of the reference at global frames ``[N]``."""
-        return TensorDict(
-            {k: torch.as_tensor(self.reference[k][frame]).to(torch.float64) for k in BODY_KEYS}, batch_size=frame.shape
-        )
-
-    def first_state(self, frame: Tensor) -> tuple[Tensor, Tensor]:
-        """``qpos [n, nq]`` and ``qvel [n, nv]`` of episodes that begin at global frames ``[n]``.
-
-        The reference's, or where it stands and faces the state a forecast begins in.
-        """
-        if self.forecasts is not None:
-            return self.forecasts.first_state(frame, self._qpos.index_select(0, frame), self._range.T.numpy())
-        return self._qpos.index_select(0, frame), self._qvel.index_select(0, frame)
+    humanoid: HumanoidModel
+    takes: TakeTable
+    reward: RewardTable
+    observation_sizes: Mapping[str, int]
+    endings: tuple[str, ...]
+    ends_episode: frozenset[str]
+    remembers_start: bool
+    actions_move_targets: bool
 
     def view(self, state: BodyState | BodyView) -> BodyView:
-        """``state`` and what follows from it; the functions below take either, and share the work given a view."""
-        return state if isinstance(state, BodyView) else BodyView(state, self.layout)
+        """``state`` and what follows from it; every other method takes either."""
+        ...
+
+    def observations(self, state: BodyState | BodyView, frame: Tensor) -> dict[str, Tensor]:
+        """``[N, size]`` float64 by key, of states at global frames ``[N]``."""
+        ...
+
+    def step_view(self, state: BodyState | BodyView, frame: Tensor, step: Tensor, **parts: Any) -> StepView:
+        """What reward terms see; ``parts`` are those of the view that the reward needs."""
+        ...
+
+    def rewards(self, view: StepView) -> tuple[Tensor, dict[str, Tensor]]:
+        """Reward ``[N]`` of a step and its terms."""
+        ...
 
     def target(self, action: Tensor, frame: Tensor, placed: Tensor | None = None) -> Tensor:
-        """PD targets ``[N, nu]`` rad from actions ``[N, nu]``, for reaching frames ``[N]``; within joint range.
+        """Controls ``[N, nu]`` from actions ``[N, A]``, for reaching frames ``[N]``."""
+        ...
 
-        ``placed [N, nu]`` rad, the joint angles each body was placed with, is read by ``action.reference`` ``start``.
+    def ended(self, state: BodyState | BodyView, take: Tensor) -> dict[str, Tensor]:
+        """``[N]`` bool by ending, of worlds that act out ``take [N]``."""
+        ...
 
-        With ``action.kind`` ``torque``: torques ``[N, nu]`` N m, within their limits.
-        """
-        if self.action.kind == "torque":
-            share = torch.clamp(self.action.scale * action.to(torch.float64), -1.0, 1.0)
-            return share * torch.as_tensor(self.humanoid.torque_limit)
-        if self.action.reference == "start":
-            if placed is None:
-                raise ValueError("action.reference=start needs the joint angles the bodies were placed with")
-            base = placed
-        else:
-            base = self._rest if self._table is None else self._table.index_select(0, frame)
-        return torch.clamp(base + self.action.scale * action.to(torch.float64), self._range[0], self._range[1])
+    def first_state(self, frame: Tensor) -> tuple[Tensor, Tensor]:
+        """``qpos [n, nq]`` and ``qvel [n, nv]`` of episodes that begin at global frames ``[n]``."""
+        ...
 
-    def observation(self, state: BodyState | BodyView) -> Tensor:
-        """The humanoid state ``[N, 115]``, float64; worked out on arrays (trace ``view(state).humanoid_state``)."""
-        body = self.view(state)
-        return torch.from_numpy(humanoid_state_rows(body.qpos.numpy(), body.qvel.numpy()))
-
-    def rewards(self, state: BodyState | BodyView, frame: Tensor, step: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
-        """Reward ``[N]`` and its terms for states at global frames ``[N]``, ``step [N]`` steps into the episode."""
-        reference = SimpleNamespace(**{name: table.index_select(0, frame) for name, table in self._rewarded.items()})
-        return self.reward(self.view(state), reference, step)
-
-    def fallen(self, state: BodyState | BodyView, take: Tensor, head_drop: Tensor | None = None) -> Tensor:
-        """``[N]``: the head is too low for ``take [N]``, whether or not that ends the episode.
-
-        ``head_drop [N]`` m stands in for the task's while training has one of its own.
-        """
-        lowest = self.takes.lowest_head_height.index_select(0, take)
-        head = self.view(state).xpos[:, self.humanoid.head, 2]
-        return terminations.fallen(head, lowest, self.termination.head_drop if head_drop is None else head_drop)
+    def followed(self, starts: Tensor | None = None) -> Followed:
+        """What bodies follow whose episodes begin at global frames ``[W]``."""
+        ...

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import torch
 from torch import Tensor
 
+from egopose.core.config import from_mapping
+from egopose.core.errors import InputError
 from egopose.data.fragments import FragmentLike
-from egopose.envs.aids import AdaptiveStartSettings
 
 
 class Piece(NamedTuple):
@@ -40,11 +41,71 @@ class Episodes:
 
 
 class Starts(Protocol):
-    """Deals episodes to worlds."""
+    """Deals episodes to worlds. What it learns on the way is in its state."""
 
     def __call__(self, worlds: Tensor, generator: torch.Generator) -> Episodes:
         """Episodes for ``worlds [n]`` (indices)."""
         ...
+
+    def ended(self, start: Tensor, frames: Tensor, fell: Tensor) -> None:
+        """Take note of episodes that ended.
+
+        Args:
+            start: ``[n]`` global frames they began at.
+            frames: ``[n]`` they lasted.
+            fell: ``[n]`` whether they ended before their time.
+        """
+        ...
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """All that later episodes depend on, but for the generator."""
+        ...
+
+    def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
+        """Go on from :meth:`state_dict`."""
+        ...
+
+
+class Unlearning:
+    """Starts that take no note of how episodes end."""
+
+    def ended(self, start: Tensor, frames: Tensor, fell: Tensor) -> None:
+        """See :class:`Starts`."""
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """See :class:`Starts`."""
+        return {}
+
+    def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
+        """See :class:`Starts`."""
+
+
+@dataclass(frozen=True)
+class AdaptiveStartSettings:
+    """See :class:`AdaptiveStarts`; the setting ``task.starts`` where its ``kind`` is ``adaptive``.
+
+    Args:
+        bin: frames whose episodes are judged together.
+        unit: frames survived that halve how often a bin is drawn.
+        rate: of the running estimate: the share of the newest episode in it.
+        floor: share of the episodes that start uniformly.
+
+    Raises:
+        InputError: a value out of range.
+    """
+
+    bin: int
+    unit: float
+    rate: float
+    floor: float
+
+    def __post_init__(self) -> None:
+        for name in ("bin", "unit"):
+            if not getattr(self, name) > 0:
+                raise InputError("task.starts", name, f"must be positive, not {getattr(self, name)}")
+        for name in ("rate", "floor"):
+            if not 0 < getattr(self, name) <= 1:
+                raise InputError("task.starts", name, f"must lie above 0 and be at most 1, not {getattr(self, name)}")
 
 
 def _bounds(fragments: Sequence[FragmentLike], offsets: Tensor, lengths: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -58,7 +119,7 @@ def _bounds(fragments: Sequence[FragmentLike], offsets: Tensor, lengths: Tensor)
     return take, offsets[take] + local[:, 0], offsets[take] + local[:, 1]
 
 
-class UniformStarts:
+class UniformStarts(Unlearning):
     """Every frame that leaves room enough is as likely a start as any other.
 
     Args:
@@ -154,8 +215,16 @@ class AdaptiveStarts(UniformStarts):
         for at, value in zip(number.tolist(), lasted.tolist(), strict=True):
             self.survived[at] += self.settings.rate * (value - self.survived[at])
 
+    def state_dict(self) -> dict[str, Tensor]:
+        """See :class:`Starts`."""
+        return {"survived": self.survived.clone()}
 
-class WholeFragments:
+    def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
+        """See :class:`Starts`."""
+        self.survived = state["survived"].clone()
+
+
+class WholeFragments(Unlearning):
     """For evaluation: world i runs fragment i (modulo their number) from its first frame to its last."""
 
     def __init__(self, fragments: Sequence[FragmentLike], offsets: Tensor, lengths: Tensor) -> None:
@@ -164,3 +233,31 @@ class WholeFragments:
     def __call__(self, worlds: Tensor, generator: torch.Generator) -> Episodes:
         fragment = worlds % len(self._take)
         return Episodes(self._take[fragment], self._start[fragment], self._stop[fragment])
+
+
+def training_starts(
+    settings: Mapping[str, Any] | None,
+    fragments: Sequence[FragmentLike],
+    offsets: Tensor,
+    lengths: Tensor,
+    horizon: int,
+    minimum: int,
+) -> UniformStarts:
+    """The starts that ``task.starts`` asks for.
+
+    Args:
+        settings: ``{kind: uniform}``, or ``{kind: adaptive}`` and :class:`AdaptiveStartSettings`; None for uniform.
+        fragments, offsets, lengths, horizon, minimum: see :class:`UniformStarts`.
+
+    Raises:
+        InputError: another kind, or a setting of it is wrong.
+        ValueError: see :class:`UniformStarts`.
+    """
+    values = dict(settings or {"kind": "uniform"})
+    kind = values.pop("kind", None)
+    if kind == "adaptive":
+        adaptive = from_mapping(AdaptiveStartSettings, values, "task.starts")
+        return AdaptiveStarts(fragments, offsets, lengths, horizon, minimum, adaptive)
+    if kind != "uniform" or values:
+        raise InputError("task.starts", "kind", f"must be uniform, or adaptive with its settings, not {settings!r}")
+    return UniformStarts(fragments, offsets, lengths, horizon, minimum)

@@ -144,7 +144,7 @@ def _together(
     )
     ahead = None
     if planner is not None:
-        ahead = Planner(make_env(worlds * planner.samples), agent.actor, agent.critic, states, planner)
+        ahead = Planner(make_env(worlds * planner.samples), agent.actor, agent.critic, planner)
     estimates = estimate_takes(
         env, agent.actor, agent.critic, states, guard, counterfactuals=counterfactuals, planner=ahead
     )
@@ -225,7 +225,7 @@ def survival_figures(
     """
     env = agent.make_env(split, num_envs=num_envs, threads=threads)
     controllers: dict[str, Controller] = {"policy": agent.actor, "start_policy": start_policy}
-    if env.base_env.problem.action.kind == "pd":
+    if env.base_env.problem.actions_move_targets:
         controllers |= {"base_tracking": base_tracking(env), "reference_tracking": reference_tracking(env)}
     out = {}
     for name, controller in controllers.items():

@@ -22,6 +22,7 @@ from egopose.pipeline.agent import load_agent
 from egopose.pipeline.dataset import absolute_paths, load_dataset
 from egopose.pipeline.networks import build_networks
 from egopose.pipeline.training import run_training
+from egopose.tasks.task import task_of
 
 _BUDGETS = {"full": "demo", "short": "demo_short"}
 _SHORTEST_TRAINING = 45.0  # s, on a machine so slow that the budget is used up before
@@ -103,7 +104,7 @@ def show_shipped(config: Mapping[str, Any], out: Path) -> dict[str, str]:
             continue
         agent = load_agent(f"{PREFIX}{name}", overrides={"data": config["data"]})
         names, videos = take_videos(agent.config)
-        forecasts = own["task"]["name"] == "forecasting"
+        forecasts = task_of(own).protocol == "forecasts"
         settings = compose_config("evaluate", [f"checkpoint={PREFIX}{name}", *_looks(config, forecasts)])
         print(f"\n{PREFIX}{name} on the same held-out frames, of people it has not seen (docs/model-card.md):")
         try:

@@ -28,7 +28,7 @@ from egopose.inference.forecast_contexts import SOURCES, past_states
 from egopose.inference.forecast_start import begin_forecasts
 from egopose.inference.forecaster import Forecasts, forecast
 from egopose.inference.outputs import RENDERED_NOTE, TakeVideo, file_name, write_footage, write_motion_files
-from egopose.inference.planner import Planner, followed_forecasts
+from egopose.inference.planner import Planner
 from egopose.inference.planner_settings import PlannerSettings, planner_settings
 from egopose.models.baselines.recurrent import RecurrentForecaster
 from egopose.motion.io import write_motion
@@ -37,6 +37,7 @@ from egopose.motion.rotations import Array
 from egopose.pipeline.agent import Agent
 from egopose.pipeline.baselines import forecast_qpos, load_baseline
 from egopose.tasks.dataset import Dataset
+from egopose.tasks.task import task_of
 
 OURS, DRAWN, STILL = "ours", "ours, drawn", "standing still"
 
@@ -101,7 +102,7 @@ def run_forecast_evaluation(
     compared = dict(values.pop("baselines", None) or {})
     settings = from_mapping(ForecastSettings, values, "conf/evaluate.yaml: forecast")
     for agent in agents:
-        if agent.config["task"].get("context") is None:
+        if task_of(agent.config).protocol != "forecasts":
             raise InputError(agent.path, "task", "this run does not forecast, others of these do")
     dataset, split = agents[0].dataset, str(config["split"])
     humanoid, fps = dataset.humanoid, 1.0 / dataset.humanoid.control_dt
@@ -176,7 +177,8 @@ def windows_of(agent: Agent, split: str, settings: ForecastSettings) -> list[For
     if split not in ("train", "test"):
         raise InputError("conf/evaluate.yaml", "split", f"must be train or test, not {split!r}")
     fragments: Sequence[FragmentLike] = agent.dataset.train if split == "train" else agent.dataset.test
-    context = int(agent.config["task"]["context"])
+    context = task_of(agent.config).context(agent.config)
+    assert context is not None  # a forecasting run is asked
     horizon = settings.horizon or int(agent.config["task"]["horizon"]) - 1
     windows = forecast_windows(fragments, context, horizon, settings.every)
     if not windows:
@@ -230,12 +232,12 @@ def forecast_windows_of(
         env = agent.make_env(num_envs=len(drawn), fragments=drawn, **options)
         qpos, qvel = (state[at : at + together] for state in states)
         horizon, seed = part[0].horizon, settings.seed + at
-        ahead, futures = None, agent.dataset.forecasts
-        if planner is not None and futures is not None:
+        ahead, forecasts = None, agent.dataset.forecasts
+        if planner is not None and forecasts is not None:
             now = torch.tensor([int(agent.dataset.takes.offsets[w.take]) + w.now for w in part])
             copies = agent.make_env(num_envs=len(part) * planner.samples, fragments=part, **options)
-            followed, row = followed_forecasts(futures, now)
-            ahead = Planner(copies, agent.actor, agent.critic, followed, planner, row)
+            followed = copies.base_env.problem.followed(now)
+            ahead = Planner(copies, agent.actor, agent.critic, planner, followed)
         with torch_threads(1):
             parts.append(forecast(env, agent.actor, qpos, qvel, samples, horizon, seed, settings.noise_time, ahead))
         env.close()

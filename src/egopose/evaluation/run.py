@@ -12,7 +12,16 @@ from egopose.evaluation.reports import evaluation_report
 from egopose.evaluation.reset_threshold import choose_threshold
 from egopose.evaluation.take_videos import take_videos
 from egopose.pipeline.agent import load_agent
+from egopose.tasks.task import task_of
 from egopose.vision.corruption import Corruption
+
+
+def _estimates(*arguments: Any) -> str:
+    return summary(run_evaluation(*arguments))
+
+
+#: How policies of a task are scored, by what the task says; see :class:`egopose.tasks.task.Task`.
+PROTOCOLS = {"estimates": _estimates, "forecasts": run_forecast_evaluation}
 
 
 def evaluate(values: Mapping[str, Any]) -> str:
@@ -39,10 +48,7 @@ def evaluate(values: Mapping[str, Any]) -> str:
     spoilt = Corruption.from_config(values) is not None
     part = f"{values['split']}-corrupted" if spoilt else str(values["split"])
     out = output_folder(values["out"], agents[0].path, part)
-    if agents[0].config["task"]["name"] == "forecasting":
-        text = run_forecast_evaluation(values, agents, names, videos, out)
-    else:
-        text = summary(run_evaluation(values, agents, names, videos, out))
+    text = PROTOCOLS[task_of(agents[0].config).protocol](values, agents, names, videos, out)
     if values["report"]:
         text += f"\nreport: {evaluation_report(out, agents[0].dataset.humanoid)}"
     return text

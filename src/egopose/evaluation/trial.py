@@ -14,12 +14,12 @@ from torchrl.envs import TransformedEnv
 from torchrl.envs.transforms import Transform
 
 from egopose.envs.env import EgoPoseEnv
-from egopose.envs.starts import Episodes, Starts
+from egopose.envs.starts import Episodes, Starts, Unlearning
 
 _FLAGS = ("running", "survived", "fell")
 
 
-class SameStarts:
+class SameStarts(Unlearning):
     """Deals the same episodes again and again.
 
     Args:

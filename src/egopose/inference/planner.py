@@ -11,7 +11,7 @@ plays no part.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from types import SimpleNamespace
 
 import numpy as np
@@ -24,47 +24,18 @@ from egopose.collection.stepping import Entries, parts_of, run_parts
 from egopose.core.errors import InputError
 from egopose.envs.env import EgoPoseEnv
 from egopose.envs.forecasting_transforms import RecurrentStates
-from egopose.envs.mdp.rewards import Reward, build_reward
-from egopose.envs.reference_forecasts import ReferenceForecasts
+from egopose.envs.mdp.rewards import build_reward
+from egopose.envs.mdp.step_view import StepView
+from egopose.envs.problem import Followed
 from egopose.inference.planner_settings import PlannerSettings
 from egopose.models.pose_regression import state_to_qpos
 
 _EPISODE = ("take", "start", "stop", "frame")  # with one number for each body
-Rows = Callable[[Mapping[str, Tensor]], Tensor]
-"""Of what an environment writes: which row of what is followed each body should be in, ``[N]`` int64."""
 
 _PARTS = (0.25, 0.5, 0.75)  # of the best way, tried in later rounds
 _ELITES = (2, 4, 8)  # ways whose means are tried
 _NARROWED = 0.5  # of the additions' deviation, about the mean of the second of these
 _BROKEN = 1000.0  # what a way loses whose physics break: more than any sum of rewards
-
-
-def global_frame(entries: Mapping[str, Tensor]) -> Tensor:
-    """The row of a table of all frames."""
-    return entries["frame"].squeeze(-1)
-
-
-def followed_forecasts(forecasts: ReferenceForecasts, starts: Tensor) -> tuple[Tensor, Rows]:
-    """What bodies follow that follow the forecasts from these frames.
-
-    Args:
-        forecasts: forecasts.
-        starts: ``[W]`` global frames, each once.
-
-    Returns:
-        States z ``[W * (horizon + 1), S]`` of every step, and the rows of a body in its episode; behind the horizon the
-        last.
-    """
-    steps = torch.arange(forecasts.horizon + 1)
-    states = forecasts.states(starts.repeat_interleave(len(steps)), steps.repeat(len(starts)))
-    number = torch.full((forecasts.frames,), -1, dtype=torch.int64)
-    number[starts] = torch.arange(len(starts))
-
-    def row(entries: Mapping[str, Tensor]) -> Tensor:
-        start, step = entries["episode_start"].squeeze(-1), entries["episode_step"].squeeze(-1)
-        return number[start] * len(steps) + step.clamp(max=forecasts.horizon)
-
-    return states, row
 
 
 class Planner:
@@ -75,10 +46,8 @@ class Planner:
             frozen.
         actor, critic: policy and value network, in evaluation mode; sequences of modules that read and write plain
             entries.
-        states: ``[R, 2 nq - 3]`` the humanoid states the policy follows: the regressor's of every global frame, or
-            :func:`followed_forecasts`.
         settings: see :class:`PlannerSettings`.
-        row: which of them.
+        followed: what the bodies follow; None for what the problem says of all frames.
 
     Attributes:
         value: ``[N]`` what the best way was worth: discounted rewards and, at the horizon, V; nothing for a body that
@@ -93,25 +62,25 @@ class Planner:
         env: TransformedEnv,
         actor: TensorDictModuleBase,
         critic: TensorDictModuleBase,
-        states: Tensor,
         settings: PlannerSettings,
-        row: Rows = global_frame,
+        followed: Followed | None = None,
     ) -> None:
         base = env.base_env
         assert isinstance(base, EgoPoseEnv)
         problem, humanoid = base.problem, base.problem.humanoid
-        if problem.action.kind != "pd":
+        if not problem.actions_move_targets:
             raise InputError(
                 "planner", "action", "a planner moves targets of PD controllers, not torques: planner=none"
             )
         if any(isinstance(part, RecurrentStates) for part in env.transform):
             raise InputError("planner", "model.memory", "a planner's ways begin without a memory: planner=none")
-        self.settings, self._env, self._base, self._row = settings, env, base, row
+        self.settings, self._env, self._base = settings, env, base
         # The mean is what a deterministic policy does: no need of the distribution behind it.
         gaussian = isinstance(actor, ProbabilisticTensorDictSequential)
         self._actor = [part for step in (actor.module[:-1] if gaussian else [actor]) for part in parts_of(step)]
         self._action, self._critic = "loc" if gaussian else "action", parts_of(critic)
-        self._reward: Reward = build_reward(settings.reward)
+        self._reward = build_reward(settings.reward)
+        states, self._row = problem.followed() if followed is None else followed
         env.reset()
         self._followed, self._head_height = self._what_is_followed(states)
         hinges = [joint.name for joint in humanoid.skeleton.joints for _ in joint.dofs]
@@ -241,7 +210,7 @@ class Planner:
             body, after = copies.try_step(seen[self._action] + candidates[:, :, step].flatten(0, 1))
             row = self._row(after)
             followed = SimpleNamespace(**{name: rows.index_select(0, row) for name, rows in self._followed.items()})
-            reward, _ = self._reward(body, followed, after["episode_step"].squeeze(-1))
+            reward, _ = self._reward(StepView(body, followed, after["episode_step"].squeeze(-1)))
             low = (self._head_height[row] - body.xpos[:, problem.humanoid.head, 2]).clamp(min=0.0)
             velocity = body.qvel.numpy()
             acceleration = torch.from_numpy(np.abs(velocity - before).mean(1) * rate)

@@ -61,7 +61,7 @@ def run_estimate(config: Mapping[str, Any], agent: Agent, pose_motion: Motion, v
     planner = None
     if settings is not None:
         copies = agent.make_env("test", num_envs=settings.samples, **{**options, "threads": int(config["threads"])})
-        planner = Planner(copies, agent.actor, agent.critic, states, settings)
+        planner = Planner(copies, agent.actor, agent.critic, settings)
     (estimate,) = estimate_takes(env, agent.actor, agent.critic, states, guard, lookahead, planner=planner)
     env.close()
     if planner is not None:

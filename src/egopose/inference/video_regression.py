@@ -23,6 +23,7 @@ from egopose.models.regressor import StateRegressor
 from egopose.motion.motion import Motion
 from egopose.pipeline.regressor import joint_targets
 from egopose.tasks.dataset import Dataset
+from egopose.tasks.task import task_of
 from egopose.vision.features import encode
 
 
@@ -92,7 +93,7 @@ def seen_live(
 
 def require_estimation(run: Mapping[str, Any], checkpoint: str | Path) -> None:
     """Raises InputError: the configuration ``run`` of a checkpoint is of a policy that forecasts."""
-    if run["task"].get("context") is not None:
+    if task_of(run).protocol != "estimates":
         raise InputError(checkpoint, "task", "this run forecasts; an estimation policy is needed here")
 
 

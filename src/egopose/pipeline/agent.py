@@ -22,7 +22,8 @@ from egopose.pipeline.dataset import run_dataset
 from egopose.pipeline.environment import build_env
 from egopose.pipeline.forecaster import with_forecasts
 from egopose.pipeline.networks import build_networks
-from egopose.tasks.dataset import Dataset, smoothed
+from egopose.tasks.dataset import Dataset
+from egopose.tasks.task import task_name, task_of
 
 _STORE_GROUPS = {"data", "humanoid"}
 
@@ -53,7 +54,7 @@ class Agent:
         Raises:
             InputError: there is no regressor.
         """
-        states = smoothed(self.dataset, float(self.config["task"]["action"].get("smoothing", 0.0))).states
+        states = task_of(self.config).followed(self.config, self.dataset).states
         if states is None:
             raise InputError(self.path, "regressor", "the policy starts from the state regressor, and there is none")
         return states
@@ -83,7 +84,7 @@ def load_agent(
         dataset = run_dataset(config, folder.resolve().parent.parent, same_store)
     dataset = with_forecasts(config, dataset, folder.resolve().parent.parent)
     env = build_env(config, dataset, num_envs=1)
-    require(metadata, folder, task=str(config["task"]["name"]), action_size=int(env.action_spec.shape[-1]))
+    require(metadata, folder, task=task_name(config), action_size=int(env.action_spec.shape[-1]))
     actor, critic = build_networks(config, dataset, env)
     RunCheckpoint({"policy": actor, "critic": critic, "transforms": env}).restore(folder)
     statistics = copy.deepcopy(env.state_dict())

@@ -19,7 +19,7 @@ from egopose.checkpoint.resume import continued_job, finished, mark_finished
 from egopose.core.atomic_write import write_text_whole
 from egopose.core.errors import InputError
 from egopose.data.fragments import FragmentLike
-from egopose.data.preparation import flow_name, global_spans, store_folder
+from egopose.data.preparation import fingerprint_of, flow_name, global_spans, store_folder
 from egopose.data.spans import Span
 from egopose.data.splits import split_takes
 from egopose.data.store import TakeStore
@@ -32,8 +32,8 @@ from egopose.models.pose_regression import integrate_root, pose_regression, spli
 from egopose.motion import rotations as rot
 from egopose.motion.motion import Motion
 from egopose.motion.rotations import Array
-from egopose.pipeline.dataset import load_dataset, run_dataset
-from egopose.tasks.dataset import Dataset
+from egopose.pipeline.dataset import PreparedData
+from egopose.tasks.dataset import Dataset, require_same_store
 from egopose.training.fitting import Fit, FitResult, FitSettings, State, fit
 from egopose.training.logging import write_provenance
 from egopose.training.loop import stop_signals
@@ -59,7 +59,9 @@ def run_baseline(
         InputError: the configuration, the data or the checkpoint do not fit.
     """
     if dataset is None:
-        dataset = load_dataset(config) if checkpoint is None else run_dataset(config, folder)
+        if checkpoint is not None:
+            require_same_store(folder, fingerprint_of(config))
+        dataset = PreparedData(config, None if checkpoint is None else folder).seen_motions()
     dataset.keep_regressor(folder)
     dataset.keep_provenance(folder)
     settings = FitSettings.from_config(config["baseline"]["optimiser"])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,16 +16,50 @@ from egopose.data.store import TakeStore
 from egopose.envs.mdp.observations import humanoid_state
 from egopose.pipeline.regressor import kept_tables, regressor_tables
 from egopose.tasks.dataset import Dataset, require_same_store, take_table
+from egopose.tasks.task import task_of
+
+
+@dataclass(frozen=True)
+class PreparedData:
+    """What a task can make its dataset of: a configuration's own data. See :class:`egopose.tasks.task.Sources`.
+
+    Args:
+        config: resolved. Its data is prepared where that has not been done yet.
+        run: the run directory whose state regressor looks at the data, with nothing trained; None for the data's own
+            regressor, trained where that has not been done yet.
+        progress: show bars.
+    """
+
+    config: Mapping[str, Any]
+    run: Path | None = None
+    progress: bool = True
+
+    def motions(self) -> Dataset:
+        """See :class:`~egopose.tasks.task.Sources`."""
+        store = prepare(self.config, progress=self.progress, flow=False)
+        return replace(_motion_of(self.config, store), store_fingerprint=store.fingerprint)
+
+    def seen_motions(self) -> Dataset:
+        """See :class:`~egopose.tasks.task.Sources`.
+
+        Raises:
+            InputError: neither run nor store holds a regressor.
+        """
+        config = self.config
+        store = prepare(config, progress=self.progress)
+        humanoid, flow = humanoid_of(config), flow_name(config)
+        if self.run is None:
+            return _with_tables(config, store, *regressor_tables(config, store, humanoid, flow))
+        return _with_tables(config, store, *kept_tables(config, store, humanoid, flow, self.run / "regressor"))
 
 
 def load_dataset(config: Mapping[str, Any], progress: bool = True) -> Dataset:
-    """The dataset ``config`` names: data prepared and state regressor trained where that has not been done yet.
+    """The dataset of the task that ``config`` names.
 
     Raises:
         InputError: data cannot be found or used, the split leaves nothing, or a setting is wrong.
     """
-    store = prepare(config, progress=progress)
-    return _with_tables(config, store, *regressor_tables(config, store, humanoid_of(config), flow_name(config)))
+    return task_of(config).dataset(config, PreparedData(config, progress=progress))
 
 
 def run_dataset(config: Mapping[str, Any], run: Path, same_store: bool = True, progress: bool = True) -> Dataset:
@@ -43,9 +77,7 @@ def run_dataset(config: Mapping[str, Any], run: Path, same_store: bool = True, p
     if same_store:
         # Before anything is prepared: hours could pass, only to be refused.
         require_same_store(run, fingerprint_of(config))
-    store = prepare(config, progress=progress)
-    tables = kept_tables(config, store, humanoid_of(config), flow_name(config), run / "regressor")
-    return _with_tables(config, store, *tables)
+    return task_of(config).dataset(config, PreparedData(config, run, progress))
 
 
 def _with_tables(config: Mapping[str, Any], store: TakeStore, tables: TensorDictBase, weights: Path) -> Dataset:

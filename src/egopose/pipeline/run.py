@@ -20,14 +20,12 @@ from torchrl.envs import TransformedEnv
 from egopose.collection.collectors import CollectorSettings, build_collector, transform_state
 from egopose.core.errors import InputError
 from egopose.core.runtime import settle_heap
-from egopose.envs.aids import Aids
 from egopose.envs.mdp.observations import humanoid_state
 from egopose.models.recurrent import collecting_policy
 from egopose.pipeline.environment import build_env
 from egopose.pipeline.networks import build_networks
 from egopose.tasks.dataset import Dataset
 from egopose.training.adversarial import AdversarialPPO, DiscriminatorSettings
-from egopose.training.exploration import SigmaSchedule, sigma_buffers
 from egopose.training.loop import Evaluation, LoopSettings, Run, interrupts_held
 from egopose.training.ppo import PPO, PPOSettings
 from egopose.training.survival import frames_survived
@@ -57,7 +55,6 @@ def build_run(config: Mapping[str, Any], folder: Path, dataset: Dataset) -> Run:
     actor, critic = build_networks(config, dataset, probe)
     action_size = int(probe.action_spec.shape[-1])
     probe.close()
-    sigma = _sigma_schedule(config, actor)
     with interrupts_held():
         collector = build_collector(
             collector_settings,
@@ -70,17 +67,7 @@ def build_run(config: Mapping[str, Any], folder: Path, dataset: Dataset) -> Run:
     else:
         ppo = PPO(actor, critic, ppo_settings)
     settle_heap()
-    return Run(ppo, collector, settings, collector_settings, folder, config, action_size, sigma)
-
-
-def _sigma_schedule(config: Mapping[str, Any], actor: TensorDictModuleBase) -> SigmaSchedule | None:
-    """As ``aids.sigma`` says, None for a sigma that stays."""
-    settings = Aids.from_config(config.get("aids")).sigma
-    if settings is None:
-        return None
-    if config["model"]["learn_sigma"]:
-        raise InputError("configuration", "aids.sigma", "is for a fixed sigma, and model.learn_sigma is true")
-    return SigmaSchedule(sigma_buffers(actor), settings.sigma, float(config["model"]["sigma"]), settings.steps)
+    return Run(ppo, collector, settings, collector_settings, folder, config, action_size)
 
 
 def _adversarial(
@@ -111,8 +98,6 @@ def _training_env(
         threads=settings.physics_threads,
         seed=int(config["seed"]) * 1000 + worker,
         dump_dir=folder / "diverged",
-        aids=Aids.from_config(config.get("aids")),
-        workers=1 if settings.kind == "sync" else settings.workers,
     )
 
 

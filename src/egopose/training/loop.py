@@ -23,7 +23,7 @@ from egopose.collection.collectors import CollectorSettings
 from egopose.collection.workers import WorkerLost
 from egopose.core.config import from_mapping
 from egopose.core.errors import InputError
-from egopose.training.exploration import SigmaSchedule
+from egopose.tasks.task import task_name
 from egopose.training.logging import ProgressLine, Scalars
 from egopose.training.ppo import PPO, TrainingDiverged
 
@@ -109,9 +109,8 @@ class Run:
         settings: see :class:`LoopSettings`.
         collector_settings: threads.
         folder: the run directory.
-        config: resolved, as plain containers; ``config["task"]["name"]`` names the task.
+        config: resolved, as plain containers; its task is :attr:`task`.
         action_size: of the environment.
-        sigma: of the exploration as the run goes on; None where it stays.
     """
 
     ppo: PPO
@@ -121,13 +120,12 @@ class Run:
     folder: Path
     config: Mapping[str, Any]
     action_size: int
-    sigma: SigmaSchedule | None = None
     counters: Counters = field(default_factory=Counters)
     _saved: tuple[int, Path] | None = None
 
     @property
     def task(self) -> str:
-        return str(self.config["task"]["name"])
+        return task_name(self.config)
 
     def checkpoint(self) -> checkpoints.RunCheckpoint:
         """The components bound to this run's live objects."""
@@ -292,8 +290,6 @@ def iterate(run: Run, batches: Iterator[TensorDictBase]) -> dict[str, float]:
     threads, counters = run.collector_settings, run.counters
     clock = [time.monotonic()]
     collectors.set_threads(threads.threads)
-    if run.sigma is not None:
-        run.sigma.set(counters.frames)
     # Watched one by one: TorchRL takes an error in the first for a late answer and goes on.
     with worker_watch(run.collector):
         run.collector.update_policy_weights_()

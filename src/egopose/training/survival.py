@@ -11,7 +11,7 @@ from torchrl.envs import TransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from egopose.envs.env import EgoPoseEnv
-from egopose.envs.problem import ImitationProblem
+from egopose.envs.imitation import ImitationProblem
 from egopose.envs.test_time import Controller, prepare_for_test
 
 
@@ -61,6 +61,7 @@ def reference_tracking(env: TransformedEnv) -> Controller:
     base = env.base_env
     assert isinstance(base, EgoPoseEnv)
     problem = base.problem
+    assert isinstance(problem, ImitationProblem)
 
     def track(observation: TensorDictBase) -> TensorDictBase:
         frame = torch.minimum(observation["frame"] + 1, observation["episode_stop"] - 1).squeeze(-1)

@@ -41,6 +41,7 @@ from egopose.pipeline.forecaster import ForecastCurves, still_forecasts
 from egopose.pipeline.regressor import load_regressor
 from egopose.pipeline.regressor_input import body_part_estimator_name, load_body_part_estimator_of, planes_of
 from egopose.tasks.dataset import Dataset
+from egopose.tasks.task import task_name, task_of
 from egopose.vision.flow import FlowConfig
 from egopose.vision.lens import Camera
 
@@ -126,12 +127,11 @@ def load_forecaster(values: Mapping[str, Any], trained: Trained) -> Forecaster |
         return None
     folder = find_checkpoint(str(checkpoint), str(values["forecast"]["which"]))
     config = read_json(folder, "config")
-    task = config["task"]
     follows = config.get("forecaster") is not None
-    if task.get("context") is None or not (follows or config["model"]["context"]["source"] == "past"):
+    if task_of(config).protocol != "forecasts" or not (follows or config["model"]["context"]["source"] == "past"):
         cause = "a live forecast is one of `egopose train experiment=forecasting`, or `forecasting_follow`"
         cause += "; name such a run, or null for none"
-        raise InputError(folder, "task", f"this run's is {task['name']}: {cause}")
+        raise InputError(folder, "task", f"this run's is {task_name(config)}: {cause}")
     humanoid = humanoid_of(config)
     if humanoid.skeleton != trained.humanoid.skeleton or humanoid.control_dt != trained.humanoid.control_dt:
         raise InputError(folder, "humanoid", "another body than the estimating run's: train both with one humanoid")
@@ -144,7 +144,8 @@ def load_forecaster(values: Mapping[str, Any], trained: Trained) -> Forecaster |
     ):
         cause = "another limb finder than the estimating run's: train both with one regressor"
         raise InputError(folder, "regressor.kernel.body_parts", cause)
-    dataset = still_frames(humanoid, regressor, source_config, task["context"] + task["minimum"])
+    frames = (task_of(config).context(config) or 0) + int(config["task"]["minimum"])
+    dataset = still_frames(humanoid, regressor, source_config, frames)
     curves = None
     if follows:
         dataset = still_forecasts(config, dataset)

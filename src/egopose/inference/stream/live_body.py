@@ -19,6 +19,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from egopose.core.errors import InputError
 from egopose.envs.env import EgoPoseEnv
+from egopose.envs.imitation import ImitationProblem
 from egopose.envs.test_time import prepare_for_test
 from egopose.envs.transforms import StateNormalizer, TrackingError
 from egopose.humanoid.foot_geometry import out_of_floor
@@ -97,6 +98,7 @@ class LiveBody:
         if any(isinstance(module, PastContext) for module in actor.modules()):
             raise InputError("checkpoint", "model.context.source", "past: a forecasting policy cannot estimate")
         prepare_for_test(env, actor, critic)
+        assert isinstance(base.problem, ImitationProblem)  # a live body follows what the regressor sees
         self._base, self._problem, self._physics = base, base.problem, base.physics
         self._actor, self._critic = actor, critic
         self._transforms = [t for t in env.transform if isinstance(t, TrackingError | StateNormalizer)]

@@ -1,0 +1,87 @@
+"""What tasks share whose bodies imitate reference motion."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import torch
+from torchrl.envs.transforms import Transform
+
+from egopose.core.errors import InputError
+from egopose.data.fragments import FragmentLike
+from egopose.envs.imitation import ActionSettings, ImitationProblem, TerminationSettings
+from egopose.envs.mdp.rewards import build_reward
+from egopose.envs.problem import Problem
+from egopose.envs.starts import Starts, WholeFragments, training_starts
+from egopose.envs.transforms import StateNormalizer, VisualContext
+from egopose.tasks.dataset import Dataset, smoothed
+from egopose.tasks.task import Sources
+
+
+class ImitationTask:
+    """Bodies imitate the reference motion of takes, seen through the state regressor. Tasks build on it."""
+
+    name: str
+    protocol: str
+
+    def context(self, config: Mapping[str, Any]) -> int | None:
+        """See :class:`~egopose.tasks.task.Task`."""
+        return None
+
+    def check(self, config: Mapping[str, Any]) -> None:
+        """See :class:`~egopose.tasks.task.Task`."""
+
+    def dataset(self, config: Mapping[str, Any], sources: Sources) -> Dataset:
+        """See :class:`~egopose.tasks.task.Task`."""
+        return sources.seen_motions()
+
+    def followed(self, config: Mapping[str, Any], dataset: Dataset) -> Dataset:
+        """What the regressor saw, smoothed as ``task.action`` says."""
+        return smoothed(dataset, float(config["task"]["action"].get("smoothing", 0.0)))
+
+    def problem(self, config: Mapping[str, Any], dataset: Dataset, endings_end: bool | None) -> ImitationProblem:
+        """See :class:`~egopose.tasks.task.Task`.
+
+        Raises:
+            ValueError: the dataset lacks what the configuration asks for.
+        """
+        task = config["task"]
+        termination = {**task["termination"], **({} if endings_end is None else {"enabled": endings_end})}
+        return ImitationProblem(
+            dataset.humanoid,
+            dataset.reference,
+            dataset.takes,
+            build_reward(config["reward"]),
+            ActionSettings(**task["action"]),
+            TerminationSettings(**termination),
+            dataset.joint_targets,
+            dataset.forecasts,
+            dataset.states,
+        )
+
+    def transforms(self, config: Mapping[str, Any], dataset: Dataset, problem: Problem) -> list[Transform]:
+        """The visual context, where it is the regressor's, and the state's normaliser."""
+        normalizer = StateNormalizer(problem.observation_sizes["humanoid_state"])
+        if config["model"]["context"]["source"] != "frozen":
+            return [normalizer]
+        if dataset.visual_context is None:
+            raise InputError("configuration", "model.context.source", "frozen needs a trained state regressor")
+        return [VisualContext(dataset.visual_context), normalizer]
+
+    def starts(
+        self, config: Mapping[str, Any], problem: Problem, fragments: Sequence[FragmentLike], whole_fragments: bool
+    ) -> Starts:
+        """See :class:`~egopose.tasks.task.Task`; in training as ``task.starts`` says."""
+        task, takes = config["task"], problem.takes
+        if whole_fragments:
+            return WholeFragments(fragments, takes.offsets, takes.lengths)
+        horizon, minimum = task["horizon"], task["minimum"]
+        return training_starts(task.get("starts"), fragments, takes.offsets, takes.lengths, horizon, minimum)
+
+
+def training_deviation(states: torch.Tensor, dataset: Dataset, floor: float) -> torch.Tensor:
+    """``[S]``: deviation of states ``[F, S]`` on the training frames, floored for still numbers."""
+    offsets = dataset.takes.offsets
+    rows = [states[int(offsets[f.take]) + f.start : int(offsets[f.take]) + f.stop] for f in dataset.train]
+    return torch.cat(rows).std(dim=0).clamp_min(floor)

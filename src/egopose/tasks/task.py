@@ -1,0 +1,131 @@
+"""The task: a value that the rest of the pipeline asks, so that nobody asks for its name.
+
+A task is a file of this room that ends in ``TASK = ...``, and a file of ``conf/task`` whose ``name`` is the file's. A
+task outside of the package is a module that the environment variable ``EGOPOSE_TASKS`` names (several with commas
+between), or an entry point of the group ``egopose.tasks``. A configuration alone can make nothing be imported.
+"""
+
+from __future__ import annotations
+
+import importlib
+import os
+import pkgutil
+from collections.abc import Mapping, Sequence
+from importlib.metadata import entry_points
+from pathlib import Path
+from typing import Any, Protocol
+
+from torchrl.envs.transforms import Transform
+
+from egopose.core.errors import InputError
+from egopose.data.fragments import FragmentLike
+from egopose.envs.problem import Problem
+from egopose.envs.starts import Starts
+from egopose.tasks.dataset import Dataset
+
+#: Modules of one's own that hold tasks, with commas between.
+VARIABLE = "EGOPOSE_TASKS"
+GROUP = "egopose.tasks"
+
+
+class Sources(Protocol):
+    """What a task can make its dataset of; the pipeline gives it."""
+
+    def motions(self) -> Dataset:
+        """Humanoid, reference and fragments: no video is rendered or looked at."""
+        ...
+
+    def seen_motions(self) -> Dataset:
+        """:meth:`motions` with what the state regressor sees in the wearer's videos."""
+        ...
+
+
+class Task(Protocol):
+    """One task. Every method takes the resolved configuration.
+
+    Attributes:
+        name: of its file and of ``conf/task``.
+        protocol: how a policy of it is scored, a key of :data:`egopose.evaluation.run.PROTOCOLS`.
+    """
+
+    name: str
+    protocol: str
+
+    def context(self, config: Mapping[str, Any]) -> int | None:
+        """Frames that are seen before an episode begins; None where it begins with what it sees."""
+        ...
+
+    def check(self, config: Mapping[str, Any]) -> None:
+        """Raises InputError: the configuration does not fit the task; names the field."""
+        ...
+
+    def dataset(self, config: Mapping[str, Any], sources: Sources) -> Dataset:
+        """What the task is trained on and judged by."""
+        ...
+
+    def followed(self, config: Mapping[str, Any], dataset: Dataset) -> Dataset:
+        """The dataset as policy and body see it."""
+        ...
+
+    def problem(self, config: Mapping[str, Any], dataset: Dataset, endings_end: bool | None) -> Problem:
+        """The problem on :meth:`followed` data.
+
+        Args:
+            config: resolved.
+            dataset: see :meth:`followed`.
+            endings_end: whether an ending (a fall) ends an episode; None for what the configuration says.
+        """
+        ...
+
+    def transforms(self, config: Mapping[str, Any], dataset: Dataset, problem: Problem) -> list[Transform]:
+        """Of the observation, in their order; ``dataset`` as of :meth:`followed`."""
+        ...
+
+    def starts(
+        self, config: Mapping[str, Any], problem: Problem, fragments: Sequence[FragmentLike], whole_fragments: bool
+    ) -> Starts:
+        """Where episodes begin; with ``whole_fragments`` each world runs its own fragment from end to end."""
+        ...
+
+
+def task_name(config: Mapping[str, Any]) -> str:
+    """The name of a configuration's task."""
+    return str(config["task"]["name"])
+
+
+def task_of(config: Mapping[str, Any]) -> Task:
+    """The task of a configuration.
+
+    Raises:
+        InputError: there is none of that name; names those there are.
+    """
+    name = task_name(config)
+    tasks = {
+        module.name: f"{__package__}.{module.name}" for module in pkgutil.iter_modules([str(Path(__file__).parent)])
+    }
+    if name in tasks and (found := getattr(importlib.import_module(tasks[name]), "TASK", None)) is not None:
+        return found
+    others = _others()
+    if name in others:
+        return others[name]
+    known = [n for n, module in tasks.items() if hasattr(importlib.import_module(module), "TASK")]
+    there = ", ".join(sorted([*known, *others]))
+    raise InputError(
+        "configuration", "task.name", f"there is no task {name!r}; there are {there} (your own: {VARIABLE})"
+    )
+
+
+def _others() -> dict[str, Task]:
+    """Tasks outside of the package, by name."""
+    modules = [word.strip() for word in os.environ.get(VARIABLE, "").split(",") if word.strip()]
+    found: dict[str, Task] = {}
+    for module in modules:
+        try:
+            task = importlib.import_module(module).TASK
+        except (ImportError, AttributeError) as error:
+            raise InputError(VARIABLE, module, f"gives no task: {error}") from None
+        found[task.name] = task
+    for point in entry_points(group=GROUP):
+        task = point.load()
+        found.setdefault(task.name, task)
+    return found
