@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 from humanoid_stand_in import stand_in
 
-from egopose.humanoid.physics import BatchedPhysics, _Worker
+from egopose.humanoid.physics import BatchedPhysics
+from egopose.humanoid.physics_worker import Worker
 
 
 @pytest.fixture(scope="module")
@@ -80,7 +81,7 @@ def test_parts_of_the_worlds_may_be_under_way_together(humanoid) -> None:
 def test_a_threads_error_reaches_who_waits(humanoid, monkeypatch) -> None:
     physics, ctrl = started(humanoid, 4, threads=2), controls(humanoid, 4, 1)[0]
     with monkeypatch.context() as broken:
-        broken.setattr(_Worker, "step", lambda *_: 1 / 0)
+        broken.setattr(Worker, "step", lambda *_: 1 / 0)
         physics.begin_step(ctrl)
         with pytest.raises(ZeroDivisionError):
             physics.end_step()

@@ -26,10 +26,12 @@ from egopose.envs.env import EgoPoseEnv
 from egopose.envs.forecasting_transforms import RecurrentStates
 from egopose.envs.mdp.rewards import Reward, build_reward
 from egopose.envs.reference_forecasts import ReferenceForecasts
+from egopose.humanoid.physics import PER_WORLD
 from egopose.inference.planner_settings import PlannerSettings
 from egopose.models.pose_regression import state_to_qpos
 
 _EPISODE = ("take", "start", "stop", "frame")  # with one number for each body
+_ROWS = ("placed", *(f"physics.{name}" for name in PER_WORLD))  # with more
 Rows = Callable[[Mapping[str, Tensor]], Tensor]
 """Of what an environment writes: which row of what is followed each body should be in, ``[N]`` int64."""
 
@@ -263,7 +265,8 @@ class Planner:
         samples = self.settings.samples
         own = self._base.state_dict()
         own |= {name: state[name].repeat(samples) for name in _EPISODE}
-        own |= {name: state[name].repeat(samples, 1) for name in ("physics.state", "placed") if name in state}
+        rows = {name: state[name] for name in _ROWS if name in state}
+        own |= {name: row.repeat(samples, *[1] * (row.ndim - 1)) for name, row in rows.items()}
         self._base.load_state_dict(own)
 
     def close(self) -> None:
