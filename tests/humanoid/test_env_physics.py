@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 from humanoid_stand_in import stand_in
 
-from egopose.humanoid.physics import BatchedPhysics, _Worker
+from egopose.humanoid.physics import BatchedPhysics
+from egopose.humanoid.physics_worker import Worker
 
 
 @pytest.fixture(scope="module")
@@ -65,11 +66,10 @@ def test_parts_of_the_worlds_may_be_under_way_together(humanoid) -> None:
     """Ranges that no thread's share divides, two begun before the first is waited for: the same to the bit."""
     whole, parts = started(humanoid, 21), started(humanoid, 21, threads=2)
     ranges = (slice(0, 13), slice(13, 21))
-    wrench = np.random.default_rng(2).uniform(-50.0, 50.0, (21, 6))
     for ctrl in controls(humanoid, 21, 4):
-        whole.step(ctrl, wrench)
+        whole.step(ctrl)
         for worlds in ranges:
-            parts.begin_step(ctrl[worlds], worlds, wrench[worlds])
+            parts.begin_step(ctrl[worlds], worlds)
         for worlds in ranges:
             assert not parts.end_step(worlds).any()
     np.testing.assert_array_equal(whole.state, parts.state)
@@ -80,7 +80,7 @@ def test_parts_of_the_worlds_may_be_under_way_together(humanoid) -> None:
 def test_a_threads_error_reaches_who_waits(humanoid, monkeypatch) -> None:
     physics, ctrl = started(humanoid, 4, threads=2), controls(humanoid, 4, 1)[0]
     with monkeypatch.context() as broken:
-        broken.setattr(_Worker, "step", lambda *_: 1 / 0)
+        broken.setattr(Worker, "step", lambda *_: 1 / 0)
         physics.begin_step(ctrl)
         with pytest.raises(ZeroDivisionError):
             physics.end_step()

@@ -12,7 +12,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from egopose.humanoid.physics import Array, BatchedPhysics
+from egopose.humanoid.physics import STATE, Array, BatchedPhysics
 
 
 @dataclass
@@ -27,14 +27,14 @@ class StepRecorder:
         begin: Any = self.physics._begin
         parts: list[tuple[Array, Array]] = []
 
-        def recorded(ctrl: Array, worlds: slice, wrench: Array | None) -> Any:
+        def recorded(ctrl: Array, worlds: slice) -> Any:
             parts.append((self.physics.state[worlds].copy(), ctrl.copy()))
             # Ranges of worlds take turns, in order.
             if sum(len(part) for _, part in parts) == self.physics.num_envs:
                 for record, columns in zip((self.states, self.ctrls), zip(*parts, strict=True), strict=True):
                     record.append(np.concatenate(columns))
                 parts.clear()
-            return begin(ctrl, worlds, wrench)
+            return begin(ctrl, worlds)
 
         self.physics._begin = recorded  # type: ignore[method-assign]
 
@@ -64,12 +64,12 @@ class RawReplay:
         return time.perf_counter() - start
 
     def _run_share(self, worlds: list[int], states: list[Array], ctrls: list[Array]) -> None:
-        model, substeps, full = self._model, self._substeps, mujoco.mjtState.mjSTATE_FULLPHYSICS
+        model, substeps = self._model, self._substeps
         data = mujoco.MjData(model)
         held, warm = data.ctrl, data.qacc_warmstart
         for state, ctrl in zip(states, ctrls, strict=True):
             for i in worlds:
-                mujoco.mj_setState(model, data, state[i], full)
+                mujoco.mj_setState(model, data, state[i], STATE)
                 held[:], warm[:] = ctrl[i], self._warm_starts[i]
                 mujoco.mj_step(model, data, substeps)
                 self._warm_starts[i] = warm

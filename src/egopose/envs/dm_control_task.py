@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from tensordict import TensorDict
 from torch import Tensor
 
+from egopose.envs.mdp.step_view import StepView
 from egopose.envs.problem import Problem
 from egopose.envs.starts import Starts
 
@@ -58,12 +59,17 @@ class EgoPoseTask(control.Task):
     step has discount 0 after an ending or diverged physics and 1 at the end of the fragment or horizon.
 
     Args:
-        problem: humanoid, reference, reward, action and termination.
+        problem: of a bare floor; watches the body alone.
         starts: deals episodes.
         seed: of the starts.
+
+    Raises:
+        ValueError: the problem watches contacts, torques, targets or boxes.
     """
 
     def __init__(self, problem: Problem, starts: Starts, seed: int = 0) -> None:
+        if problem.watched:
+            raise ValueError(f"one world of dm_control tells of the body alone, not of {', '.join(problem.watched)}")
         self.problem, self.starts = problem, starts
         self._generator = torch.Generator().manual_seed(seed)
         self._take, self._start, self._stop, self._frame = (torch.zeros(1, dtype=torch.int64) for _ in range(4))
@@ -94,16 +100,18 @@ class EgoPoseTask(control.Task):
         return OrderedDict(**seen, frame=self._frame.numpy().copy())
 
     def get_reward(self, physics: HumanoidPhysics) -> float:
-        view = self.problem.step_view(self._body_state(physics), self._frame, self._frame - self._start)
-        reward, terms = self.problem.rewards(view)
+        reward, terms = self.problem.rewards(self._step_view(physics))
         self.reward_terms = {k: 0.0 if physics.diverged else float(v) for k, v in terms.items()}
         return 0.0 if physics.diverged else float(reward)
 
     def get_termination(self, physics: HumanoidPhysics) -> float | None:
-        endings = self.problem.ended(self._body_state(physics), self._take)
+        endings = self.problem.ended(self._step_view(physics), self._take)
         if physics.diverged or any(bool(endings[name]) for name in self.problem.ends_episode):
             return 0.0
         return 1.0 if bool(self._frame >= self._stop - 1) else None
+
+    def _step_view(self, physics: HumanoidPhysics) -> StepView:
+        return self.problem.step_view(self._body_state(physics), self._frame, self._frame - self._start)
 
     def _body_state(self, physics: HumanoidPhysics) -> TensorDict:
         # The step ends with mj_step1, so positions are those of the present qpos.

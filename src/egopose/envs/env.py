@@ -15,6 +15,7 @@ from torchrl.data import Binary, Composite, Unbounded
 from torchrl.envs import EnvBase
 
 from egopose.envs.mdp.observations import BodyState, BodyView
+from egopose.envs.mdp.step_view import Contacts, StepView
 from egopose.envs.problem import BODY_KEYS, Problem
 from egopose.envs.starts import Starts
 from egopose.humanoid.physics import ALL, Array, BatchedPhysics, Indices
@@ -25,9 +26,10 @@ _STEPS_REWARDED_AT_ONCE = 8  # of all worlds: measured, at 64 worlds; twice or h
 
 
 class _Unrewarded(NamedTuple):
-    """What the reward of a step reads: body state, ``[N]`` global frame, steps into the episode, diverged."""
+    """What the reward of a step reads: body state, other parts, ``[N]`` frame, steps into the episode, diverged."""
 
     state: dict[str, Tensor]
+    parts: dict[str, Tensor]
     frame: Tensor
     step: Tensor
     diverged: Tensor
@@ -35,9 +37,19 @@ class _Unrewarded(NamedTuple):
 
 def _joined(steps: list[_Unrewarded]) -> _Unrewarded:
     """Steps one after the other, as if of many worlds."""
-    state = {key: torch.cat([step.state[key] for step in steps]) for key in steps[0].state}
-    frame, step, diverged = (torch.cat(column) for column in list(zip(*steps, strict=True))[1:])
-    return _Unrewarded(state, frame, step, diverged)
+    state, parts = (
+        {key: torch.cat([row[key] for row in rows]) for key in rows[0]} for rows in list(zip(*steps, strict=True))[:2]
+    )
+    frame, step, diverged = (torch.cat(column) for column in list(zip(*steps, strict=True))[2:])
+    return _Unrewarded(state, parts, frame, step, diverged)
+
+
+def _step_parts(arrays: Mapping[str, Tensor]) -> dict[str, Any]:
+    """Keyword arguments of a problem's ``step_view``."""
+    parts: dict[str, Any] = {name: arrays[name] for name in ("torques", "target", "scene") if name in arrays}
+    if "floor" in arrays:
+        parts["contacts"] = Contacts(arrays["floor"], arrays["boxes"])
+    return parts
 
 
 def _replaced(counter: Counter, rows: NDArray[np.integer] | slice, values: Counter) -> Counter:
@@ -125,12 +137,15 @@ class EgoPoseEnv(EnvBase):
             threads,
             body_ids=humanoid.body_ids,
             dump_dir=dump_dir,
+            contacts="contacts" in problem.watched,
+            torques="torques" in problem.watched,
         )
         self._generator = torch.Generator().manual_seed(seed)
         # Arrays, as everything that is worked out for the few worlds of a step but what is put in entries: an operator
         # of torch costs several times as much.
         self._take, self._start, self._stop, self._frame = np.zeros((4, num_envs), dtype=np.int64)
         self.placed = torch.zeros(num_envs, humanoid.mj_model.nu, dtype=torch.float64)
+        self._targets = torch.zeros(num_envs, humanoid.mj_model.nu, dtype=torch.float64)
         self._unrewarded: list[_Unrewarded] | None = None
         self._earnings: list[Tensor] = []
         self._no_flags = _no_flags(problem.endings, self.batch_size)
@@ -190,11 +205,15 @@ class EgoPoseEnv(EnvBase):
     def _reward_waiting(self) -> None:
         if self._unrewarded:
             steps, self._unrewarded = self._unrewarded, []
-            self._earnings.append(self._earned(*_joined(steps)))
+            all_steps = _joined(steps)
+            view = self.problem.step_view(
+                all_steps.state, all_steps.frame, all_steps.step, **_step_parts(all_steps.parts)
+            )
+            self._earnings.append(self._earned(view, all_steps.diverged))
 
-    def _earned(self, state: BodyState | BodyView, frame: Tensor, step: Tensor, diverged: Tensor) -> Tensor:
-        """Reward and terms ``[n, 1 + K]`` float32 at global frames ``[n]``; a diverged world earns nothing."""
-        reward, terms = self.problem.rewards(self.problem.step_view(state, frame, step))
+    def _earned(self, view: StepView, diverged: Tensor) -> Tensor:
+        """Reward and terms ``[n, 1 + K]`` float32 of a step; a diverged world earns nothing."""
+        reward, terms = self.problem.rewards(view)
         return (torch.stack([reward, *terms.values()], dim=-1) * ~diverged[:, None]).float()
 
     @property
@@ -237,6 +256,9 @@ class EgoPoseEnv(EnvBase):
         self._start = _replaced(self._start, rows, episodes.start.numpy())
         self._stop = _replaced(self._stop, rows, episodes.stop.numpy())
         self._frame = _replaced(self._frame, rows, episodes.start.numpy())
+        scene = self.problem.boxes(episodes.start, self._generator)
+        if scene is not None:
+            self.physics.place_boxes(rows, *(part.numpy() for part in scene))
         if state:
             self.place(worlds, *state)
         else:
@@ -327,29 +349,46 @@ class EgoPoseEnv(EnvBase):
         frame = np.minimum(self._frame[worlds] + 1, self._stop[worlds] - 1)
         # A new counter, not new values in the old one: that is in the observations given out.
         self._frame = _replaced(self._frame, worlds, frame)
-        return self.problem.target(action.detach(), torch.from_numpy(frame), self.placed[worlds]).numpy()
+        target = self.problem.target(action.detach(), torch.from_numpy(frame), self.placed[worlds])
+        if "target" in self.problem.watched:
+            self._targets[worlds] = target
+        return target.numpy()
+
+    def _watched(self, worlds: slice) -> dict[str, Tensor]:
+        """What the problem watches of the present step beside the body, copies ``[n, ...]``."""
+        physics, watched = self.physics, self.problem.watched
+        out: dict[str, NDArray[Any]] = {}
+        if "contacts" in watched:
+            out["floor"], out["boxes"] = physics.floor_contacts[worlds], physics.box_contacts[worlds]
+        if "torques" in watched:
+            out["torques"] = physics.torques[worlds]
+        if "scene" in watched:
+            out["scene"] = np.concatenate([physics.box_tops[worlds], physics.box_quaternions[worlds]], axis=-1)
+        tensors = {name: torch.from_numpy(np.array(value)) for name, value in out.items()}
+        return tensors | ({"target": self._targets[worlds].clone()} if "target" in watched else {})
 
     def _arrived(self, stopped: NDArray[np.bool_], worlds: slice) -> dict[str, Any]:
         body = {k: torch.from_numpy(v) for k, v in self.physics.body_state(worlds).items()}
-        state = self.problem.view(body)
-        endings = self.problem.ended(state, torch.from_numpy(self._take[worlds]))
+        clock = self._clock(worlds)
+        frame, steps = clock["frame"].squeeze(-1), clock["episode_step"].squeeze(-1)
+        parts = self._watched(worlds)
+        view = self.problem.step_view(body, frame, steps, **_step_parts(parts))
+        endings = self.problem.ended(view, torch.from_numpy(self._take[worlds]))
         terminated = stopped
         for name in self.problem.ends_episode:
             terminated = terminated | endings[name].numpy()
         truncated = (self._frame[worlds] >= self._stop[worlds] - 1) & ~terminated
         done = terminated | truncated
-        clock = self._clock(worlds)
-        frame, steps = clock["frame"].squeeze(-1), clock["episode_step"].squeeze(-1)
         if done.any():
             rows = torch.from_numpy(done)
             start = torch.from_numpy(self._start[worlds])
             self.starts.ended(start[rows], steps[rows], torch.from_numpy(terminated)[rows])
         diverged = torch.from_numpy(stopped)
         if self._unrewarded is None:
-            earned = self._earned(state, frame, steps, diverged)
+            earned = self._earned(view, diverged)
             reward, terms = earned[:, :1], self._terms(earned[:, 1:])
         else:
-            self._unrewarded.append(_Unrewarded(body, frame, steps, diverged))
+            self._unrewarded.append(_Unrewarded(body, parts, frame, steps, diverged))
             # Some at a time: what is worked out between fits the core's cache, and the physics goes on meanwhile.
             if len(self._unrewarded) * len(stopped) >= _STEPS_REWARDED_AT_ONCE * self.batch_size[0]:
                 self._reward_waiting()
@@ -357,7 +396,7 @@ class EgoPoseEnv(EnvBase):
         flags = {"diverged": stopped, "terminated": terminated, "truncated": truncated, "done": done}
         return {
             **clock,
-            **self._observations(state, frame),
+            **self._observations(view.body, frame),
             "reward": reward,
             **terms,
             **{name: flag[:, None] for name, flag in endings.items()},

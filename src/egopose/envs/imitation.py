@@ -14,7 +14,7 @@ from egopose.envs.mdp import terminations
 from egopose.envs.mdp.observations import BodyLayout, BodyState, BodyView, humanoid_state_rows
 from egopose.envs.mdp.rewards import RewardTable
 from egopose.envs.mdp.step_view import Contacts, StepView
-from egopose.envs.problem import BODY_KEYS, Followed, TakeTable, global_frame
+from egopose.envs.problem import BODY_KEYS, Followed, Scene, TakeTable, global_frame
 from egopose.envs.reference_forecasts import ReferenceForecasts
 from egopose.humanoid.model import HumanoidModel
 from egopose.humanoid.torques import torque_driven
@@ -114,6 +114,7 @@ class ImitationProblem:
         self.ends_episode: frozenset[str] = frozenset(self.endings) if termination.enabled else frozenset()
         self.remembers_start = action.reference == "start"
         self.actions_move_targets = action.kind == "pd"
+        self.watched: frozenset[str] = reward.needs
         self.n_frames = reference.shape[0]
         self.reference = reference
         self.layout = BodyLayout(
@@ -215,11 +216,15 @@ class ImitationProblem:
         """Reward ``[N]`` of a step and its terms."""
         return self.reward(view)
 
-    def ended(self, state: BodyState | BodyView, take: Tensor) -> dict[str, Tensor]:
+    def ended(self, view: StepView, take: Tensor) -> dict[str, Tensor]:
         """``fallen [N]``: the head is too low for ``take [N]``, whether or not that ends the episode."""
         lowest = self.takes.lowest_head_height.index_select(0, take)
-        head = self.view(state).xpos[:, self.humanoid.head, 2]
+        head = view.body.xpos[:, self.humanoid.head, 2]
         return {"fallen": terminations.fallen(head, lowest, self.termination.head_drop)}
+
+    def boxes(self, frame: Tensor, generator: torch.Generator) -> Scene | None:
+        """None: reference motion is imitated on a bare floor."""
+        return None
 
     def followed(self, starts: Tensor | None = None) -> Followed:
         """What bodies follow: the forecasts that begin at ``starts [W]``, each once, or the states of every frame.

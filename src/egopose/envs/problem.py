@@ -20,6 +20,20 @@ BODY_KEYS = ("qpos", "qvel", "xpos", "xquat", "com")
 Rows = Callable[[Mapping[str, Tensor]], Tensor]
 
 
+class Scene(NamedTuple):
+    """Boxes of n worlds; a box that is not used is parked out of reach.
+
+    Attributes:
+        top: ``[n, K, 3]`` m, centres of the upper faces in the world.
+        heading: ``[n, K]`` rad about the vertical.
+        used: ``[n, K]`` bool.
+    """
+
+    top: Tensor
+    heading: Tensor
+    used: Tensor
+
+
 class Followed(NamedTuple):
     """What bodies follow at test time, where the truth is not known.
 
@@ -70,6 +84,8 @@ class Problem(Protocol):
         ends_episode: those of them that end an episode.
         remembers_start: whether targets depend on the joint angles a body was placed with.
         actions_move_targets: whether an action is added to PD targets; False where it is a torque.
+        watched: the parts of a step beyond the body that rewards or endings read, of
+            :data:`egopose.envs.mdp.rewards.PARTS`.
     """
 
     humanoid: HumanoidModel
@@ -80,6 +96,7 @@ class Problem(Protocol):
     ends_episode: frozenset[str]
     remembers_start: bool
     actions_move_targets: bool
+    watched: frozenset[str]
 
     def view(self, state: BodyState | BodyView) -> BodyView:
         """``state`` and what follows from it; every other method takes either."""
@@ -101,12 +118,19 @@ class Problem(Protocol):
         """Controls ``[N, nu]`` from actions ``[N, A]``, for reaching frames ``[N]``."""
         ...
 
-    def ended(self, state: BodyState | BodyView, take: Tensor) -> dict[str, Tensor]:
-        """``[N]`` bool by ending, of worlds that act out ``take [N]``."""
+    def ended(self, view: StepView, take: Tensor) -> dict[str, Tensor]:
+        """``[N]`` bool by ending, of a step of worlds that act out ``take [N]``."""
         ...
 
     def first_state(self, frame: Tensor) -> tuple[Tensor, Tensor]:
         """``qpos [n, nq]`` and ``qvel [n, nv]`` of episodes that begin at global frames ``[n]``."""
+        ...
+
+    def boxes(self, frame: Tensor, generator: torch.Generator) -> Scene | None:
+        """Where the boxes of the humanoid's model stand in episodes that begin at global frames ``[n]``.
+
+        None where the model has none (:func:`egopose.humanoid.boxes.with_boxes` gives it some).
+        """
         ...
 
     def followed(self, starts: Tensor | None = None) -> Followed:

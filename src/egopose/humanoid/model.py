@@ -9,7 +9,7 @@ is added after the contact forces are found, and a standing body sinks (docs/phy
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import mujoco
 import numpy as np
@@ -44,6 +44,8 @@ class HumanoidModel:
         head, feet: body indices. sole_points: ``[feet, 2, 3]`` heel and ball of each sole in the foot's frame, m.
         hand_dofs: columns among the 52 that belong to the hands.
         substeps: physics steps a control step. control_dt: seconds.
+        box_sizes: ``[K, 2]`` m, lengths and widths of a scene's boxes, see :func:`egopose.humanoid.boxes.with_boxes`.
+        touching: ``[E]`` indices among the 21 of the bodies whose contacts :class:`BatchedPhysics` can tell.
     """
 
     xml: str
@@ -63,6 +65,8 @@ class HumanoidModel:
     hand_dofs: NDArray[np.int64]
     substeps: int
     control_dt: float
+    box_sizes: Array = field(default_factory=lambda: np.zeros((0, 2)))
+    touching: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
 
 
 def build_humanoid(config: HumanoidConfig, sim: SimConfig | None = None) -> HumanoidModel:

@@ -11,9 +11,10 @@ from torchrl.envs import TransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from egopose.envs.env import EgoPoseEnv
+from egopose.humanoid.physics import PER_WORLD
 
 _WORLDS = 256  # carried on side by side: a method that falls a lot triggers thousands of times
-_OF_EACH_WORLD = ("physics.state", "take", "start", "stop", "frame", "placed")
+_OF_EACH_WORLD = (*(f"physics.{name}" for name in PER_WORLD), "take", "start", "stop", "frame", "placed")
 
 
 class CounterfactualRollouts:

@@ -27,10 +27,12 @@ from egopose.envs.forecasting_transforms import RecurrentStates
 from egopose.envs.mdp.rewards import build_reward
 from egopose.envs.mdp.step_view import StepView
 from egopose.envs.problem import Followed
+from egopose.humanoid.physics import PER_WORLD
 from egopose.inference.planner_settings import PlannerSettings
 from egopose.models.pose_regression import state_to_qpos
 
 _EPISODE = ("take", "start", "stop", "frame")  # with one number for each body
+_ROWS = ("placed", *(f"physics.{name}" for name in PER_WORLD))  # with more
 
 _PARTS = (0.25, 0.5, 0.75)  # of the best way, tried in later rounds
 _ELITES = (2, 4, 8)  # ways whose means are tried
@@ -232,7 +234,8 @@ class Planner:
         samples = self.settings.samples
         own = self._base.state_dict()
         own |= {name: state[name].repeat(samples) for name in _EPISODE}
-        own |= {name: state[name].repeat(samples, 1) for name in ("physics.state", "placed") if name in state}
+        rows = {name: state[name] for name in _ROWS if name in state}
+        own |= {name: row.repeat(samples, *[1] * (row.ndim - 1)) for name, row in rows.items()}
         self._base.load_state_dict(own)
 
     def close(self) -> None:
