@@ -1,0 +1,129 @@
+"""Which point of a marker file stands for which place of the body.
+
+Names of Pose2Sim and OpenPose (``RHip``, ``LBigToe``), MediaPipe and FreeMoCap (``left_hip``), joint centres of
+OpenSim, OpenCap and Vicon's models (``hip_r``, ``RHJC_study``) and of animation rigs (``LeftUpLeg``), the project's own
+among them. Markers on the skin have to be named by hand: nothing says how far they lie from the joint.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from egopose.errors import InputError
+from egopose.motion.mapping import SIDES
+
+#: Part on either side -> words for it, the best first. A word that a better one of another part has taken is passed
+#: over: beside ``LeftArm`` a ``LeftShoulder`` is the collar bone.
+_SIDED = {
+    "hip": "hjc hip upleg upperleg thigh femur hipjoint",
+    "knee": "kjc knee lowerleg lowleg leg shin calf tibia shank",
+    "ankle": "ajc ankle foot",
+    "shoulder": "sjc upperarm uparm arm humerus gh glenohumeral shoulder shoulderjoint",
+    "elbow": "ejc elbow forearm lowerarm lowarm radius ulna",
+    "wrist": "wjc wrist hand",
+    "toe": "bigtoe footindex toe toes toebase ball mtp foottip anktip ankletip",
+    "small_toe": "smalltoe littletoe smalltoes",
+    "heel": "heel calcn calcaneus",
+    "hand_tip": "handtip handend middle middlefinger fingertip",
+    "index": "index handindex index1 indexfinger",
+    "pinky": "pinky handpinky pinky1 pinkyfinger smallfinger",
+    "ear": "ear",
+    "eye": "eye",
+}
+_MIDDLE = {
+    "neck": "neck neckcenter neckcentre necktop c7 cervicale",
+    "head": "head headcenter headcentre skull",
+    "crown": "headtip headtop topofhead htop vertex headend headsite",
+    "nose": "nose",
+}
+#: Words that programs add and that say nothing of the place.
+_NOISE = frozenset("mixamorig cc base b bip bip01 jnt joint study augmenter augmented marker centre center jc".split())
+
+PARTS = (*(f"{side}_{part}" for side in SIDES for part in _SIDED), *_MIDDLE)
+_NEEDED = tuple(f"{side}_{part}" for side in SIDES for part in ("hip", "knee", "ankle", "shoulder", "elbow", "wrist"))
+
+
+def find_parts(
+    path: Path, names: Sequence[str], given: Mapping[str, str | Sequence[str]] | None = None
+) -> dict[str, list[int]]:
+    """Part of the body -> columns of the points whose mean stands for it.
+
+    Args:
+        path: of the file, for errors.
+        names: of its points.
+        given: part -> name or names, where the names do not say it themselves.
+
+    Raises:
+        InputError: a part that is needed has no point, ``given`` names what is not there; the names found are listed.
+    """
+    parts = _given(path, names, given or {})
+    words = [_words(name) for name in _without_common_start(names)]
+    taken = {column for columns in parts.values() for column in columns}
+    for side in (*SIDES, ""):
+        for part, aliases in (_SIDED if side else _MIDDLE).items():
+            key = f"{side}_{part}" if side else part
+            if key in parts:
+                continue
+            for alias in aliases.split():
+                hits = [k for k, word in enumerate(words) if word == (side, alias) and k not in taken]
+                if hits:
+                    parts[key] = hits[:1]
+                    taken.add(hits[0])
+                    break
+    missing = [part for part in _NEEDED if part not in parts]
+    if missing:
+        shown = ", ".join(names[:60])[:400] + (" ..." if len(names) > 60 else "")
+        cause = (
+            f"no point is known as {', '.join(missing)}; name them with points={{{missing[0]}: NAME}}, "
+            f"or [NAME, NAME] for the middle of two; the file has: {shown or 'none'}"
+        )
+        raise InputError(path, "points", cause)
+    return parts
+
+
+def _given(path: Path, names: Sequence[str], given: Mapping[str, str | Sequence[str]]) -> dict[str, list[int]]:
+    if not isinstance(given, Mapping):
+        raise InputError(path, "option points", "must map parts of the body to names of points")
+    parts = {}
+    for part, value in given.items():
+        if part not in PARTS:
+            raise InputError(path, f"option points.{part}", f"is no part; there are {', '.join(PARTS)}")
+        wanted = [value] if isinstance(value, str) else list(value)
+        absent = [str(name) for name in wanted if name not in names]
+        if absent or not wanted:
+            cause = f"there is no point {', '.join(absent)[:80] or 'in an empty list'}; the file has: "
+            raise InputError(path, f"option points.{part}", cause + ", ".join(names)[:400])
+        parts[part] = [list(names).index(name) for name in wanted]
+    return parts
+
+
+def _without_common_start(names: Sequence[str]) -> list[str]:
+    """Names without what stands before a ``:``, and without a word that all of them begin with."""
+    short = [name.rpartition(":")[2] for name in names]
+    start = os.path.commonprefix(short) if len(short) > 1 else ""
+    cut = max(start.rfind("_"), start.rfind(" ")) + 1
+    return [name[cut:] for name in short]
+
+
+def _words(name: str) -> tuple[str, str]:
+    """Side (``""`` in the middle) and the name's own word in small letters: ``RBigToe`` is ``("right", "bigtoe")``."""
+    tokens = [t.lower() for t in re.findall(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+", name)]
+    tokens = [t for t in tokens if t not in _NOISE]
+    side = ""
+    for mark, which in (("left", "left"), ("right", "right"), ("l", "left"), ("r", "right")):
+        if mark in tokens:
+            side = which
+            tokens.remove(mark)
+            break
+    word = "".join(tokens)
+    if not side:
+        for mark, which in (("left", "left"), ("right", "right"), ("l", "left"), ("r", "right")):
+            if word.startswith(mark) and word[len(mark) :] in _WORDS:
+                return which, word[len(mark) :]
+    return side, word
+
+
+_WORDS = frozenset(word for aliases in _SIDED.values() for word in aliases.split())
