@@ -81,6 +81,9 @@ def motion_of_points(
     columns = find_parts(path, names, given)
     metres = UNITS[unit or declared_unit]
     scaled = np.where((points == 0.0).all(axis=2, keepdims=True), np.nan, points) * metres
+    for side in SIDES:
+        if f"{side}_toe" in set(columns) - set(given or ()):
+            columns[f"{side}_toe"] = _furthest(scaled, columns[f"{side}_toe"], columns[f"{side}_ankle"])
     parts, filled = _filled(path, {part: scaled[:, k].mean(axis=1) for part, k in columns.items()})
     _check_size(path, parts, unit or declared_unit)
     axis = up or _up_axis(parts, declared_up)
@@ -99,6 +102,15 @@ def motion_of_points(
         "fit_mm": round(1000 * left, 3),
     }
     return Motion(skeleton, qpos, fps, name=path.stem, meta=meta)
+
+
+def _furthest(points: Array, columns: list[int], ankle: list[int]) -> list[int]:
+    """Of a sole's corners the front ones: those that lie furthest from the ankle."""
+    if len(columns) < 2:
+        return columns
+    away = np.linalg.norm(points[:, columns] - points[:, ankle].mean(axis=1)[:, None], axis=2)
+    reach = np.nanmedian(np.where(np.isfinite(away).any(axis=0), away, 0.0), axis=0)
+    return [c for c, r in zip(columns, reach, strict=True) if r >= 0.9 * reach.max()]
 
 
 def _filled(path: Path, parts: dict[str, Array]) -> tuple[dict[str, Array], dict[str, int]]:
@@ -218,7 +230,7 @@ class _Body:
         if base is None:
             self._add("Neck", "Spine", TRUNK_AXES, neck, turned, crown)
             return
-        self._add("Neck", "Spine", TRUNK_AXES, neck, carried(chest, "z", base - neck))
+        self._add("Neck", "Spine", TRUNK_AXES, neck, _hanging_as_usual(chest, base - neck))
         self._add("Head", "Neck", TRUNK_AXES, base, turned, crown)
 
     def _face(self, plain: Array, up: Array | None) -> Array:
@@ -242,8 +254,7 @@ class _Body:
         out, palm = ("y", "-z") if side == "left" else ("-y", "z")
         neck = _neck(p)
         shoulder, elbow, wrist = (p[f"{side}_{part}"] for part in ("shoulder", "elbow", "wrist"))
-        collar = carried(chest, out, shoulder - neck)
-        self._add(f"{name}Shoulder", "Spine", ARM_AXES, neck, collar)
+        self._add(f"{name}Shoulder", "Spine", ARM_AXES, neck, _hanging_as_usual(chest, shoulder - neck))
         upper, lower = elbow - shoulder, wrist - elbow
         hanging = _axis_of(carried(chest, out, upper), palm)
         axis = bend_axis(chest, hanging, upper, lower, self._fps, one_way=False)
@@ -277,6 +288,11 @@ class _Body:
                 across = small - big if side == "left" else big - small
             foot = frame(("x", toe - p.get(f"{side}_heel", ankle)), ("y", across))
         self._add(f"{name}Foot", f"{name}Leg", LEG_AXES, ankle, foot, toe)
+
+
+def _hanging_as_usual(parent: Array, bone: Array) -> Array:
+    """Frames ``[T, 4]`` that are the parent's where the bone lies in it as it does on average."""
+    return carried(parent, median_bone(rot.rotate(rot.conjugate(parent), bone)), bone)
 
 
 def _axis_of(quats: Array, axis: str) -> Array:

@@ -44,10 +44,15 @@ def frame(first: tuple[str, Array], second: tuple[str, Array]) -> Array:
     return rot.continuous(rot.from_scipy(Rotation.from_matrix(matrix), (len(a),)))
 
 
-def carried(parent: Array, rest: str, bone: Array) -> Array:
-    """The parent's frames ``[T, 4]`` turned the shortest way that brings their axis ``rest`` along ``bone [T, 3]``."""
-    k, sign = _AXES[rest]
-    direction = rot.rotate(parent, np.broadcast_to(sign * np.eye(3)[k], bone.shape))
+def carried(parent: Array, rest: str | Array, bone: Array) -> Array:
+    """The parent's frames ``[T, 4]`` turned the shortest way that brings ``rest`` along ``bone [T, 3]``.
+
+    ``rest`` is an axis or a vector ``[3]`` of the parent's frame.
+    """
+    if isinstance(rest, str):
+        k, sign = _AXES[rest]
+        rest = sign * np.eye(3)[k]
+    direction = rot.rotate(parent, np.broadcast_to(rest, bone.shape))
     long = np.linalg.norm(bone, axis=-1) > _SHORTEST
     turn = rot.between(direction, np.where(long[:, None], bone, direction))
     return rot.multiply(turn, parent)

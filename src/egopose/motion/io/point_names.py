@@ -18,13 +18,13 @@ from egopose.motion.mapping import SIDES
 #: Part on either side -> words for it, the best first. A word that a better one of another part has taken is passed
 #: over: beside ``LeftArm`` a ``LeftShoulder`` is the collar bone.
 _SIDED = {
-    "hip": "hjc hip upleg upperleg thigh femur hipjoint",
+    "hip": "hjc upleg upperleg thigh femur hip",
     "knee": "kjc knee lowerleg lowleg leg shin calf tibia shank",
     "ankle": "ajc ankle foot",
     "shoulder": "sjc upperarm uparm arm humerus gh glenohumeral shoulder shoulderjoint",
     "elbow": "ejc elbow forearm lowerarm lowarm radius ulna",
     "wrist": "wjc wrist hand",
-    "toe": "bigtoe footindex toe toes toebase ball mtp foottip anktip ankletip",
+    "toe": "bigtoe footindex toe toes toebase ball mtp foottip",
     "small_toe": "smalltoe littletoe smalltoes",
     "heel": "heel calcn calcaneus",
     "hand_tip": "handtip handend middle middlefinger fingertip",
@@ -41,6 +41,9 @@ _MIDDLE = {
 }
 #: Words that programs add and that say nothing of the place.
 _NOISE = frozenset("mixamorig cc base b bip bip01 jnt joint study augmenter augmented marker centre center jc".split())
+
+#: The project's own name for a foot's end; a sole with corners has several, numbered from the second on.
+_SOLE = "foottip"
 
 PARTS = (*(f"{side}_{part}" for side in SIDES for part in _SIDED), *_MIDDLE)
 _NEEDED = tuple(f"{side}_{part}" for side in SIDES for part in ("hip", "knee", "ankle", "shoulder", "elbow", "wrist"))
@@ -69,9 +72,11 @@ def find_parts(
                 continue
             for alias in aliases.split():
                 hits = [k for k, word in enumerate(words) if word == (side, alias) and k not in taken]
+                if alias == _SOLE:
+                    hits += [k for k, (s, w) in enumerate(words) if s == side and re.fullmatch(rf"{_SOLE}\d+", w)]
                 if hits:
-                    parts[key] = hits[:1]
-                    taken.add(hits[0])
+                    parts[key] = hits if alias == _SOLE else hits[:1]
+                    taken.update(parts[key])
                     break
     missing = [part for part in _NEEDED if part not in parts]
     if missing:
@@ -118,7 +123,7 @@ def _words(name: str) -> tuple[str, str]:
             side = which
             tokens.remove(mark)
             break
-    word = "".join(tokens)
+    word = re.sub("^ankletip", _SOLE, "".join(tokens))
     if not side:
         for mark, which in (("left", "left"), ("right", "right"), ("l", "left"), ("r", "right")):
             if word.startswith(mark) and word[len(mark) :] in _WORDS:
