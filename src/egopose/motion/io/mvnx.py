@@ -61,6 +61,8 @@ for _side in ("Right", "Left"):
         f"{_side}Foot": (f"{_side}LowerLeg", LEG_AXES, ""),
         f"{_side}Toe": (f"{_side}Foot", LEG_AXES, f"p{_side}Toe"),
     }
+#: Constant bones fit MVN's joints to a fraction of a millimetre; more than this (m) is worth saying.
+_LOOSE = 0.01
 _CALIBRATION = ("identity", "tpose", "tpose-isb", "npose")
 
 
@@ -112,6 +114,12 @@ def read_mvnx(path: str | Path, *, subject: str | None = None) -> Motion:
     quats = rot.multiply(quats, rot.conjugate(tpose)[None])
     segments = [_segment(name, names, chosen.points, turn) for name, turn in zip(names, tpose, strict=True)]
     skeleton, qpos, left = skeleton_of(segments, positions, quats, "xsens")
+    notes = []
+    dropped = [name for name in chosen.segments if name not in _TREE]
+    if dropped:
+        notes.append(f"segments of no body were left out: {', '.join(dropped)[:200]}")
+    if left > _LOOSE:
+        notes.append(f"joints lie {1000 * left:.0f} mm from the file's on average: its bones do not keep their lengths")
     meta = {
         "format": "mvnx",
         "source": path.name,
@@ -120,8 +128,8 @@ def read_mvnx(path: str | Path, *, subject: str | None = None) -> Motion:
         "up": "z",
         "subject": chosen.label,
         "calibration_frames": chosen.skipped,
-        "dropped_segments": [name for name in chosen.segments if name not in _TREE],
         "fit_mm": round(1000 * left, 3),
+        "notes": notes,
     }
     return Motion(skeleton, qpos, rate, name=path.stem, meta=meta)
 

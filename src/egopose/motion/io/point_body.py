@@ -67,9 +67,8 @@ def motion_of_points(
         declared_unit, declared_up: what the file says of itself or its format's custom.
         unit, up: what the user says; None believes the file's unit, and looks for the up axis in the motion.
         given: part of the body -> names of points, see :func:`point_names.find_parts`.
-        meta: of the motion, added to: ``filled`` counts the frames in which each part was interpolated,
-            ``unused_points`` are names that play no part, ``fit_mm`` is how far joints of constant bones lie from the
-            points on average.
+        meta: of the motion, added to: ``notes`` says where gaps were filled, ``unused_points`` are names that play no
+            part, ``fit_mm`` is how far joints of constant bones lie from the points on average.
 
     Raises:
         InputError: parts missing, a unit that makes no person, points that coincide.
@@ -91,13 +90,17 @@ def motion_of_points(
     body = _Body({part: rot.rotate(turn, p) for part, p in parts.items()}, fps)
     skeleton, qpos, left = body.skeleton()
     used = {column for k in columns.values() for column in k}
+    if filled:
+        gaps = ", ".join(f"{part} in {count}" for part, count in sorted(filled.items(), key=lambda item: -item[1])[:8])
+        more = f" and {len(filled) - 8} parts more" if len(filled) > 8 else ""
+        note = f"gaps were filled by interpolation: {gaps}{more} of {len(points)} frames"
+        meta = {**meta, "notes": [*meta.get("notes", ()), note]}
     meta = {
         **meta,
         "source": path.name,
         "unit": unit or declared_unit,
         "unit_metres": metres,
         "up": axis,
-        "filled": filled,
         "unused_points": [name for k, name in enumerate(names) if k not in used][:200],
         "fit_mm": round(1000 * left, 3),
     }
@@ -234,7 +237,7 @@ class _Body:
         self._add("Head", "Neck", TRUNK_AXES, base, turned, crown)
 
     def _face(self, plain: Array, up: Array | None) -> Array:
-        """The head's frame from ears or eyes and nose, as far as they are there; ``plain`` looks where the chest does."""
+        """The head's frame from ears or eyes and nose, so far as they are there; ``plain`` looks as the chest does."""
         p = self._parts
         pair = next((k for k in ("ear", "eye") if {f"left_{k}", f"right_{k}"} <= set(p)), None)
         if pair == "ear" and "nose" in p:
@@ -262,12 +265,12 @@ class _Body:
         forearm = frame((out, lower), (palm, axis))
         self._add(f"{name}ForeArm", f"{name}Arm", ELBOW_AXES, elbow, forearm)
         fingers = [p[f"{side}_{part}"] for part in ("index", "pinky") if f"{side}_{part}" in p]
-        tip = np.mean(fingers, axis=0) if fingers else p.get(f"{side}_hand_tip")
+        tip: Array | None = np.stack(fingers).mean(axis=0) if fingers else p.get(f"{side}_hand_tip")
         hand = forearm
-        if len(fingers) == 2:
-            hand = frame((out, tip - wrist), ("x", fingers[0] - fingers[1]))
-        elif tip is not None:
+        if tip is not None:
             hand = carried(forearm, out, tip - wrist)
+            if len(fingers) == 2:
+                hand = frame((out, tip - wrist), ("x", fingers[0] - fingers[1]))
         self._add(f"{name}Hand", f"{name}ForeArm", ARM_AXES, wrist, hand, tip)
 
     def _leg(self, side: str) -> None:

@@ -7,7 +7,6 @@ among them. Markers on the skin have to be named by hand: nothing says how far t
 
 from __future__ import annotations
 
-import os
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -40,7 +39,24 @@ _MIDDLE = {
     "nose": "nose",
 }
 #: Words that programs add and that say nothing of the place.
-_NOISE = frozenset("mixamorig cc base b bip bip01 jnt joint study augmenter augmented marker centre center jc".split())
+_NOISE = frozenset(
+    [
+        "mixamorig",
+        "cc",
+        "base",
+        "b",
+        "bip",
+        "bip01",
+        "jnt",
+        "joint",
+        "jc",
+        "centre",
+        "center",
+        "marker",
+        "study",
+        "augmenter",
+    ]
+)
 
 #: The project's own name for a foot's end; a sole with corners has several, numbered from the second on.
 _SOLE = "foottip"
@@ -108,8 +124,9 @@ def _given(path: Path, names: Sequence[str], given: Mapping[str, str | Sequence[
 def _without_common_start(names: Sequence[str]) -> list[str]:
     """Names without what stands before a ``:``, and without a word that all of them begin with."""
     short = [name.rpartition(":")[2] for name in names]
-    start = os.path.commonprefix(short) if len(short) > 1 else ""
-    cut = max(start.rfind("_"), start.rfind(" ")) + 1
+    first, last = min(short), max(short)
+    alike = next((k for k, (a, b) in enumerate(zip(first, last, strict=False)) if a != b), 0)
+    cut = max(first.rfind("_", 0, alike), first.rfind(" ", 0, alike)) + 1
     return [name[cut:] for name in short]
 
 

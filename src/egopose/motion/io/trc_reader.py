@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from itertools import islice
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -51,10 +52,10 @@ def read_trc(
     declared = header.get("Units", "").lower()
     if unit is None and declared not in UNITS:
         raise InputError(path, "Units", f"{excerpt(declared)} is not known: say unit=mm or unit=m")
-    meta = {"format": "trc"}
+    meta: dict[str, Any] = {"format": "trc"}
     announced = header.get("NumFrames", "")
     if announced.isdigit() and int(announced[:12]) != len(values):
-        meta["announced_frames"] = announced[:12]
+        meta["notes"] = [f"the header announces {announced[:12]} frames, {len(values)} are there and were read"]
     return motion_of_points(
         path,
         names,
