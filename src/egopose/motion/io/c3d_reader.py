@@ -15,9 +15,9 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from egopose.errors import InputError
-from egopose.motion.io._files import MAX_JOINTS, check_values
-from egopose.motion.io.frames import UNITS
-from egopose.motion.io.point_body import motion_of_points
+from egopose.motion.io._files import MAX_JOINTS
+from egopose.motion.io.frames import UNITS, UP_AXES
+from egopose.motion.io.point_body import check_points, motion_of_points
 from egopose.motion.motion import Motion
 from egopose.motion.rotations import Array
 
@@ -106,13 +106,19 @@ def _contents(path: Path) -> tuple[list[str], Array, float, str, str]:
 def _read(path: Path, stream: BinaryIO) -> tuple[list[str], Array, float, str, str]:
     import c3d
 
-    reader = c3d.Reader(stream)
-    count, frames = int(reader.point_used), int(reader.last_frame) - int(reader.first_frame) + 1
+    class Reader(c3d.Reader):
+        """Frame numbers as Python's: two-byte ones begin again at 0 behind 65,535."""
+
+        first_frame = property(lambda self: int(super().first_frame))
+        last_frame = property(lambda self: int(super().last_frame))
+
+    reader = Reader(stream)
+    count, frames = int(reader.point_used), reader.last_frame - reader.first_frame + 1
     if not 0 < count <= MAX_JOINTS:
         raise InputError(path, "POINT:USED", f"{count} points; 1 to {MAX_JOINTS} are read")
     if not 0 < frames <= _MAX_FRAMES:
         raise InputError(path, "POINT:FRAMES", f"{frames} frames; 1 to {_MAX_FRAMES} are read")
-    check_values(path, "POINT:FRAMES", frames, 3 * count)
+    check_points(path, "POINT:FRAMES", frames, count)
     word = 4 if reader.point_scale < 0 else 2
     row = word * (4 * count + int(reader.analog_used) * int(reader.analog_per_frame))
     there = path.stat().st_size - _BLOCK * (int(reader.header.data_block) - 1)
@@ -120,15 +126,19 @@ def _read(path: Path, stream: BinaryIO) -> tuple[list[str], Array, float, str, s
         cause = f"{frames} frames of {row} bytes announced, only {max(there, 0)} are there: cut short"
         raise InputError(path, "POINT:FRAMES", cause)
     values = np.full((frames, count, 3), np.nan)
-    for k, (_, points, _) in enumerate(reader.read_frames(copy=False, analog_transform=False)):
+    read = 0
+    for _, points, _ in reader.read_frames(copy=False, analog_transform=False):
         seen = points[:, 3] >= 0
-        values[k, seen] = points[seen, :3]
+        values[read, seen] = points[seen, :3]
+        read += 1
+    if read < frames:
+        raise InputError(path, "POINT:FRAMES", f"{frames} frames announced, only {read} can be read: cut short")
     if (np.abs(np.nan_to_num(values, posinf=np.inf)) > 1e7).any():
         bad = int(np.argmax((np.abs(np.nan_to_num(values, posinf=np.inf)) > 1e7).any(axis=(1, 2))))
         raise InputError(path, f"frame {bad + 1}", "a number is infinite or absurdly large")
     unit = _text(reader, "POINT:UNITS").lower() or "mm"
     screen = _text(reader, "POINT:Y_SCREEN").lower().removeprefix("+")
-    return _names(path, reader, count), values, float(reader.point_rate), unit, screen if screen[-1:] in "xyz" else "z"
+    return _names(path, reader, count), values, float(reader.point_rate), unit, screen if screen in UP_AXES else "z"
 
 
 def _names(path: Path, reader: Any, count: int) -> list[str]:

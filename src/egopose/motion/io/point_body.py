@@ -34,6 +34,9 @@ from egopose.motion.mapping import SIDES
 from egopose.motion.motion import Motion
 from egopose.motion.rotations import Array
 
+#: The most numbers of points that are read: 40 points for twenty minutes at 120 frames/s. Fitting holds ten copies.
+_MAX_NUMBERS = 2**24
+
 #: A point that is missing in more of the frames than this share is not used.
 _MISSING = 0.5
 #: Stature over the way from ankle to neck.
@@ -42,6 +45,13 @@ _STATURE_PER_PATH = 1.22
 _NOSE_DROP = np.deg2rad(15.0)
 #: The floor is taken to be at zero where the lowest point of the clip lies this near it, m.
 _FLOOR = 0.3
+
+
+def check_points(path: Path, field: str, frames: int, count: int) -> None:
+    """Raises InputError where a file holds more than can be fitted."""
+    if 3 * frames * count > _MAX_NUMBERS:
+        cause = f"{frames} frames of {count} points; at most {_MAX_NUMBERS} numbers are read: cut the motion into parts"
+        raise InputError(path, field, cause)
 
 
 def motion_of_points(

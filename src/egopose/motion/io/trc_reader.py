@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 
 from egopose.errors import InputError
-from egopose.motion.io._files import MAX_JOINTS, check_values, excerpt, read_text
+from egopose.motion.io._files import MAX_JOINTS, excerpt, read_text
 from egopose.motion.io.frames import UNITS, frame_rate
-from egopose.motion.io.point_body import motion_of_points
+from egopose.motion.io.point_body import check_points, motion_of_points
 from egopose.motion.motion import Motion
 from egopose.motion.rotations import Array
 
@@ -83,7 +83,7 @@ def _names(path: Path, line: str) -> list[str]:
 def _rows(path: Path, lines: list[str], count: int) -> tuple[Array, Array]:
     """Times ``[T]`` and points ``[T, P, 3]``; an empty field is NaN."""
     tabs = "\t" in lines[3]
-    check_values(path, "line 7", len(lines) - 5, 3 * count)
+    check_points(path, "line 7", len(lines) - 5, count)
     rows = []
     for number, line in islice(enumerate(lines, start=1), 5, None):
         if not line.strip():
