@@ -32,7 +32,7 @@ def opened(path: str | PathLike[str], kind: str) -> Iterator[Any]:
     """The first video stream of a file.
 
     Raises:
-        ValueError: it cannot be opened or has no video; FFmpeg's words.
+        ValueError: it cannot be opened, has no video, or its codec is unknown; mostly FFmpeg's words.
     """
     import av
 
@@ -44,6 +44,8 @@ def opened(path: str | PathLike[str], kind: str) -> Iterator[Any]:
         if not container.streams.video:
             raise ValueError("no video stream")
         stream = container.streams.video[0]
+        if stream.codec_context is None:
+            raise ValueError("a codec that PyAV does not decode either")
         stream.codec_context.thread_count = _THREADS
         yield stream
 
@@ -51,7 +53,8 @@ def opened(path: str | PathLike[str], kind: str) -> Iterator[Any]:
 def header(stream: Any) -> tuple[int, int, float, int]:
     """Width, height, frames/s, number of frames as the header has them."""
     rate = float(stream.average_rate or stream.guessed_rate or 0)
-    frames = stream.frames or int(float((stream.duration or 0) * (stream.time_base or 0)) * rate)
+    seconds = float((stream.duration or 0) * (stream.time_base or 0)) or (stream.container.duration or 0) / 1e6
+    frames = stream.frames or round(seconds * rate)
     return stream.width or 0, stream.height or 0, rate, frames
 
 

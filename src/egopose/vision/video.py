@@ -138,6 +138,11 @@ def _sane(path: str | PathLike[str], width: float, height: float, fps: float, fr
     return info
 
 
+def _has_picture(capture: cv2.VideoCapture) -> bool:
+    """Whether OpenCV opened the file and found out how large its pictures are: of damaged ones it does not."""
+    return capture.isOpened() and capture.get(cv2.CAP_PROP_FRAME_WIDTH) > 0
+
+
 def _of_capture(path: str | PathLike[str], capture: cv2.VideoCapture) -> VideoInfo:
     keys = (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT, cv2.CAP_PROP_FPS, cv2.CAP_PROP_FRAME_COUNT)
     return _sane(path, *(capture.get(key) for key in keys))
@@ -148,7 +153,7 @@ def probe_video(path: str | PathLike[str]) -> VideoInfo:
     container = look_into(path)
     if container.codec not in _BEYOND_OPENCV:
         with _capture(path) as capture:
-            if capture.isOpened():
+            if _has_picture(capture):
                 return _of_capture(path, capture)
     return next(_by_pyav(path, container))[2]
 
@@ -156,7 +161,7 @@ def probe_video(path: str | PathLike[str]) -> VideoInfo:
 def _by_opencv(path: str | PathLike[str]) -> Iterator[tuple[float | None, Frame, VideoInfo]]:
     """Stamps (s), RGB frames and the header; none where OpenCV cannot decode."""
     with _capture(path) as capture:
-        if not capture.isOpened():
+        if not _has_picture(capture):
             return
         info = _of_capture(path, capture)
         while True:

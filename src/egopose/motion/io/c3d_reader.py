@@ -107,10 +107,13 @@ def _read(path: Path, stream: BinaryIO) -> tuple[list[str], Array, float, str, s
     import c3d
 
     class Reader(c3d.Reader):
-        """Frame numbers as Python's: two-byte ones begin again at 0 behind 65,535."""
+        """Frame numbers as Python's: two-byte ones begin again behind 65,535. Analog channels are not asked for."""
 
         first_frame = property(lambda self: int(super().first_frame))
         last_frame = property(lambda self: int(super().last_frame))
+
+        def get_analog_transform(self) -> tuple[float, float]:
+            return 1.0, 0.0
 
     reader = Reader(stream)
     count, frames = int(reader.point_used), reader.last_frame - reader.first_frame + 1

@@ -61,7 +61,7 @@ _NOISE = frozenset(
 #: The project's own name for a foot's end; a sole with corners has several, numbered from the second on.
 _SOLE = "foottip"
 
-PARTS = (*(f"{side}_{part}" for side in SIDES for part in _SIDED), *_MIDDLE)
+_PARTS = (*(f"{side}_{part}" for side in SIDES for part in _SIDED), *_MIDDLE)
 _NEEDED = tuple(f"{side}_{part}" for side in SIDES for part in ("hip", "knee", "ankle", "shoulder", "elbow", "wrist"))
 
 
@@ -110,8 +110,9 @@ def _given(path: Path, names: Sequence[str], given: Mapping[str, str | Sequence[
         raise InputError(path, "option points", "must map parts of the body to names of points")
     parts = {}
     for part, value in given.items():
-        if part not in PARTS:
-            raise InputError(path, f"option points.{part}", f"is no part; there are {', '.join(PARTS)}")
+        if part not in _PARTS:
+            cause = f"is no part; there are {', '.join(_MIDDLE)} and right_ or left_ {', '.join(_SIDED)}"
+            raise InputError(path, f"option points.{str(part)[:40]}", cause)
         wanted = [value] if isinstance(value, str) else list(value)
         absent = [str(name) for name in wanted if name not in names]
         if absent or not wanted:
