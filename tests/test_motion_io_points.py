@@ -257,6 +257,17 @@ def test_bodies_that_are_none(walk: Motion, tmp_path: Path) -> None:
     assert len(read_motion(path)) == 1
 
 
+def test_points_that_fall_together_leave_a_body(walk: Motion, tmp_path: Path) -> None:
+    """A neck in a shoulder, a head in the neck, toes in the ankle: no direction, but a motion."""
+    points = layout(walk, "HALPE_26")
+    points |= {"Neck": points["LShoulder"], "Head": points["LShoulder"], "RBigToe": points["RAnkle"]}
+    points |= {"RSmallToe": points["RAnkle"], "RHeel": points["RAnkle"]}
+    write_layout(tmp_path / "m.trc", points)
+    back = read_motion(tmp_path / "m.trc")
+    assert np.isfinite(back.forward_kinematics()[0]).all()
+    apart(back, walk)
+
+
 @settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(changes=st.lists(st.tuples(st.integers(0, 4000), st.integers(0, 255)), min_size=1, max_size=12))
 def test_damaged_c3d_reads_or_says_why(walk: Motion, tmp_path: Path, changes: list[tuple[int, int]]) -> None:

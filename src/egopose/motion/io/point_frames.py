@@ -47,11 +47,14 @@ def frame(first: tuple[str, Array], second: tuple[str, Array]) -> Array:
 def carried(parent: Array, rest: str | Array, bone: Array) -> Array:
     """The parent's frames ``[T, 4]`` turned the shortest way that brings ``rest`` along ``bone [T, 3]``.
 
-    ``rest`` is an axis or a vector ``[3]`` of the parent's frame.
+    ``rest`` is an axis or a vector ``[3]`` of the parent's frame; where it or the bone is too short to point anywhere
+    the parent's frame is kept.
     """
     if isinstance(rest, str):
         k, sign = _AXES[rest]
         rest = sign * np.eye(3)[k]
+    if np.linalg.norm(rest) < _SHORTEST:
+        return parent
     direction = rot.rotate(parent, np.broadcast_to(rest, bone.shape))
     long = np.linalg.norm(bone, axis=-1) > _SHORTEST
     turn = rot.between(direction, np.where(long[:, None], bone, direction))

@@ -62,6 +62,8 @@ _NOISE = frozenset(
 _SOLE = "foottip"
 
 _PARTS = (*(f"{side}_{part}" for side in SIDES for part in _SIDED), *_MIDDLE)
+#: Letters of names in an error.
+_SHOWN = 180
 _NEEDED = tuple(f"{side}_{part}" for side in SIDES for part in ("hip", "knee", "ankle", "shoulder", "elbow", "wrist"))
 
 
@@ -96,13 +98,19 @@ def find_parts(
                     break
     missing = [part for part in _NEEDED if part not in parts]
     if missing:
-        shown = ", ".join(names[:60])[:400] + (" ..." if len(names) > 60 else "")
+        more = f" and {len(missing) - 3} more" if len(missing) > 3 else ""
         cause = (
-            f"no point is known as {', '.join(missing)}; name them with points={{{missing[0]}: NAME}}, "
-            f"or [NAME, NAME] for the middle of two; the file has: {shown or 'none'}"
+            f"no point is known as {', '.join(missing[:3])}{more}; say points={{{missing[0]}: NAME}}, or [NAME, NAME] "
+            f"for the middle of two; the file has: {_excerpt(names)}"
         )
         raise InputError(path, "points", cause)
     return parts
+
+
+def _excerpt(names: Sequence[str]) -> str:
+    """Names fit for the end of an error's line."""
+    shown = " ".join(", ".join(names).split())
+    return (shown if len(shown) <= _SHOWN else shown[:_SHOWN] + " ...") or "none"
 
 
 def _given(path: Path, names: Sequence[str], given: Mapping[str, str | Sequence[str]]) -> dict[str, list[int]]:
@@ -117,7 +125,7 @@ def _given(path: Path, names: Sequence[str], given: Mapping[str, str | Sequence[
         absent = [str(name) for name in wanted if name not in names]
         if absent or not wanted:
             cause = f"there is no point {', '.join(absent)[:80] or 'in an empty list'}; the file has: "
-            raise InputError(path, f"option points.{part}", cause + ", ".join(names)[:400])
+            raise InputError(path, f"option points.{part}", cause + _excerpt(names))
         parts[part] = [list(names).index(name) for name in wanted]
     return parts
 
