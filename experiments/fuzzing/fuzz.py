@@ -28,8 +28,8 @@ sys.path.insert(0, str(HERE))
 import readers
 
 SHARES = {
-    **{"bvh": 0.2, "acclaim": 0.15, "deepmimic": 0.1, "native": 0.15, "amass": 0.1},
-    **{"tensors": 0.1, "store": 0.05, "config": 0.1, "video": 0.05},
+    **{"bvh": 0.15, "acclaim": 0.1, "deepmimic": 0.1, "native": 0.1, "amass": 0.1},
+    **{"mvnx": 0.05, "trc": 0.05, "c3d": 0.05, "tensors": 0.1, "store": 0.05, "config": 0.1, "video": 0.05},
 }
 SLOW_SECONDS, HANG_SECONDS, MEMORY_MB = 1.0, 10, 2048
 

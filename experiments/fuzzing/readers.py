@@ -24,6 +24,7 @@ HOSTILE = (
     *(b'99999999999999999999 0x10 1_0 1e5 1e7 .5 +3 \xef\xbc\x91 \xe2\x80\xae \xff { } [ ] " , : # ( )'.split()),
     *(b'true null NaN Infinity {} [] "" ${oc.env:HOME} &a *a !!python/object/apply:os.system ../x /dev/zero'.split()),
     *(b"ROOT JOINT End Site OFFSET CHANNELS Xposition Zrotation MOTION Frames: HIERARCHY".split()),
+    *(b"<!DOCTYPE <!ENTITY &a; <frame <position> </frames> type= tpose label= frameRate= PathFileType Units".split()),
     *(b":units :root :bonedata :hierarchy begin end dof axis order rx tz length angle rad :RADIANS root".split()),
 )
 
@@ -224,6 +225,22 @@ def amass_seeds() -> list[bytes]:
     return [stream.getvalue()]
 
 
+def mvnx_seeds() -> list[bytes]:
+    segments = ["Pelvis", "T8", "Head", *(f"{s}{p}" for s in ("Right", "Left") for p in ("UpperArm", "Foot", "Toe"))]
+    names = "".join(
+        f'<segment label="{n}"><points><point label="p{n}"><pos_b>0 0 .1</pos_b></point></points></segment>'
+        for n in segments
+    )
+    places = " ".join(f"0 {k / 10} 1" for k in range(len(segments)))
+    turns = "1 0 0 0 " * len(segments)
+    frames = "".join(
+        f'<frame type="{kind}"><orientation>{turns}</orientation><position>{places}</position></frame>\n'
+        for kind in ("identity", "tpose", "normal", "normal")
+    )
+    head = '<mvnx version="4" xmlns="http://www.xsens.com/mvn/mvnx"><subject label="a" frameRate="60"><segments>'
+    return [f"{head}{names}</segments>\n<frames>{frames}</frames></subject></mvnx>".encode()]
+
+
 def tensor_seeds() -> list[bytes]:
     entry = {"device": "cpu", "shape": [2, 3], "dtype": "torch.float32", "is_nested": False}
     meta = {"a": entry, "shape": [], "device": "cpu", "_type": "<class 'tensordict._td.TensorDict'>"}
@@ -283,10 +300,13 @@ READERS = {
     "deepmimic": Reader(deepmimic_seeds, read_motion_file, ".txt", _MOTION),
     "native": Reader(native_seeds, read_motion_file, ".npz", _MOTION, binary=True),
     "amass": Reader(amass_seeds, read_motion_file, ".npz", _MOTION, binary=True),
+    "mvnx": Reader(mvnx_seeds, read_motion_file, ".mvnx", _MOTION),
+    "trc": Reader(lambda: [_written(".trc")], read_motion_file, ".trc", _MOTION),
+    "c3d": Reader(lambda: [_written(".c3d")], read_motion_file, ".c3d", (*_MOTION, "c3d"), binary=True),
     "tensors": Reader(tensor_seeds, read_tensors, ".two", ("egopose.core.safe_io",)),
     "store": Reader(store_seeds, read_store, ".two", ("egopose.core.safe_io", "egopose.data.store")),
     "config": Reader(config_seeds, read_config, ".yaml", ("egopose.core.safe_io", "egopose.data.take_sources")),
-    "video": Reader(video_seeds, read_video, ".mp4", ("egopose.vision.video",), binary=True),
+    "video": Reader(video_seeds, read_video, ".mp4", ("egopose.vision",), binary=True),
 }
 
 

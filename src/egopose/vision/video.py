@@ -1,4 +1,7 @@
-"""MP4 in and out: frames are uint8 RGB ``[H, W, 3]``, times are seconds from the video's first frame."""
+"""Video in and MP4 out: frames are uint8 RGB ``[H, W, 3]``, times are seconds from the video's first frame.
+
+OpenCV decodes. Where its build lacks a codec (AV1), PyAV does, if it is installed; both give the same frames and times.
+"""
 
 from __future__ import annotations
 
@@ -14,6 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from egopose.core.errors import InputError
+from egopose.vision import pyav
+from egopose.vision.containers import Container, look_into
 
 Frame = NDArray[np.uint8]
 
@@ -28,9 +33,8 @@ MAX_GAP = 5.0
 # Decoders keep up to 16 reference frames, and one more for each thread.
 _DECODER_THREADS = 2
 
-# The kinds of box a movie file begins with. FFmpeg would open anything it knows by its content: play lists, which name
-# other files and addresses to be read, among them.
-_FIRST_BOXES = (b"ftyp", b"moov", b"mdat", b"free", b"skip", b"wide", b"pnot")
+# Codecs that OpenCV turned out not to decode in this process: it need not be asked again, nor complain again.
+_BEYOND_OPENCV: set[str] = set()
 
 
 @dataclass(frozen=True)
@@ -114,39 +118,102 @@ def write_video(path: str | PathLike[str], frames: Iterable[Frame], fps: float) 
 
 
 @contextmanager
-def _capture(path: str | PathLike[str]) -> Iterator[tuple[cv2.VideoCapture, VideoInfo]]:
-    """An opened capture whose header has been found sane."""
-    if not Path(path).is_file():
-        raise InputError(path, "video", "no such file")
-    if Path(path).stat().st_size == 0:
-        raise InputError(path, "video", "the file is empty")
-    with Path(path).open("rb") as stream:
-        if stream.read(8)[4:] not in _FIRST_BOXES:
-            raise InputError(path, "video", "not an MP4: it does not begin with a box of one")
+def _capture(path: str | PathLike[str]) -> Iterator[cv2.VideoCapture]:
+    """OpenCV's capture, opened or not."""
     capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG, [cv2.CAP_PROP_N_THREADS, _DECODER_THREADS])
     try:
-        if not capture.isOpened():
-            raise InputError(path, "video", "not a video that FFmpeg can open: damaged, or of an unknown format")
-        info = VideoInfo(
-            int(capture.get(cv2.CAP_PROP_FRAME_WIDTH)),
-            int(capture.get(cv2.CAP_PROP_FRAME_HEIGHT)),
-            float(capture.get(cv2.CAP_PROP_FPS)),
-            int(min(max(capture.get(cv2.CAP_PROP_FRAME_COUNT), 0), 2**62)),
-        )
-        if not (0 < info.width <= MAX_SIDE and 0 < info.height <= MAX_SIDE and info.width * info.height <= MAX_PIXELS):
-            cause = f"{info.width} x {info.height}; up to {MAX_SIDE} a side and {MAX_PIXELS} pixels can be read"
-            raise InputError(path, "size", cause)
-        if not 0 < info.fps <= MAX_FPS:
-            raise InputError(path, "fps", f"{info.fps}; expected more than 0 and at most {MAX_FPS:g}")
-        yield capture, info
+        yield capture
     finally:
         capture.release()
 
 
+def _sane(path: str | PathLike[str], width: float, height: float, fps: float, frames: float) -> VideoInfo:
+    """The header's numbers. Raises InputError where they cannot be."""
+    info = VideoInfo(int(width), int(height), float(fps), int(min(max(frames, 0), 2**62)))
+    if not (0 < info.width <= MAX_SIDE and 0 < info.height <= MAX_SIDE and info.width * info.height <= MAX_PIXELS):
+        cause = f"{info.width} x {info.height}; up to {MAX_SIDE} a side and {MAX_PIXELS} pixels can be read"
+        raise InputError(path, "size", cause)
+    if not 0 < info.fps <= MAX_FPS:
+        raise InputError(path, "fps", f"{info.fps}; expected more than 0 and at most {MAX_FPS:g}")
+    return info
+
+
+def _has_picture(capture: cv2.VideoCapture) -> bool:
+    """Whether OpenCV opened the file and found out how large its pictures are: of damaged ones it does not."""
+    return capture.isOpened() and capture.get(cv2.CAP_PROP_FRAME_WIDTH) > 0
+
+
+def _of_capture(path: str | PathLike[str], capture: cv2.VideoCapture) -> VideoInfo:
+    keys = (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT, cv2.CAP_PROP_FPS, cv2.CAP_PROP_FRAME_COUNT)
+    return _sane(path, *(capture.get(key) for key in keys))
+
+
 def probe_video(path: str | PathLike[str]) -> VideoInfo:
     """Size, rate and announced number of frames. Raises InputError as :func:`read_frames`."""
-    with _capture(path) as (_, info):
-        return info
+    container = look_into(path)
+    if container.codec not in _BEYOND_OPENCV:
+        with _capture(path) as capture:
+            if _has_picture(capture):
+                return _of_capture(path, capture)
+    return next(_by_pyav(path, container))[2]
+
+
+def _by_opencv(path: str | PathLike[str]) -> Iterator[tuple[float | None, Frame, VideoInfo]]:
+    """Stamps (s), RGB frames and the header; none where OpenCV cannot decode."""
+    with _capture(path) as capture:
+        if not _has_picture(capture):
+            return
+        info = _of_capture(path, capture)
+        while True:
+            try:
+                ok, bgr = capture.read()
+            except cv2.error as error:
+                raise InputError(path, "video", f"cannot be decoded: {' '.join(str(error).split())}"[:200]) from None
+            if not ok:
+                return
+            rgb = cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB).astype(np.uint8, copy=False)
+            yield capture.get(cv2.CAP_PROP_POS_MSEC) / 1000.0, rgb, info
+
+
+def _by_pyav(path: str | PathLike[str], container: Container) -> Iterator[tuple[float | None, Frame, VideoInfo]]:
+    """Like :func:`_by_opencv`, which decoded nothing. Raises InputError where PyAV cannot help, saying what would."""
+    if container.decoded_everywhere:
+        cause = f"damaged: no frame of this {container.kind} can be decoded ({container.codec_name})"
+        raise InputError(path, "video", cause + (f"; {container.cut}" if container.cut else ""))
+    convert = f"ffmpeg -i {Path(path).name} -c:v libx264 -crf 18 converted.mp4"
+    if not pyav.there():
+        cause = f"{container.codec_name} is a codec that this build of OpenCV does not decode"
+        raise InputError(path, "video", f"{cause}: pip install 'egopose[video]', or convert it with {convert}")
+    try:
+        with pyav.opened(path, container.kind) as stream:
+            width, height, fps, count = pyav.header(stream)
+            info = _sane(path, width, height, fps, count)
+            for stamp, frame in pyav.frames(stream):
+                _BEYOND_OPENCV.add(container.codec)
+                if frame.shape[:2] == (info.width, info.height):
+                    info = VideoInfo(info.height, info.width, info.fps, info.frames)  # filmed upright
+                yield stamp, frame, info
+    except ValueError as error:
+        if isinstance(error, InputError):
+            raise
+        raise InputError(path, "video", f"{container.codec_name}: {error}"[:200]) from error
+    if container.codec not in _BEYOND_OPENCV:
+        cause = (
+            f"neither OpenCV nor PyAV decodes a frame of {container.codec_name}: damaged, or convert it with {convert}"
+        )
+        raise InputError(path, "video", cause)
+
+
+def _decoded(path: str | PathLike[str]) -> Iterator[tuple[float | None, Frame, VideoInfo]]:
+    """Frames by the first of the two that decodes any. Raises InputError where neither does."""
+    container = look_into(path)
+    if container.codec not in _BEYOND_OPENCV:
+        one = None
+        for one in _by_opencv(path):
+            yield one
+        if one is not None:
+            return
+    yield from _by_pyav(path, container)
 
 
 def read_frames(path: str | PathLike[str], taken_at: float | None = None) -> Iterator[tuple[float, Frame]]:
@@ -156,42 +223,28 @@ def read_frames(path: str | PathLike[str], taken_at: float | None = None) -> Ite
     not advance (some recorders leave them out) the header's rate takes its place.
 
     Args:
-        path: any MP4.
+        path: MP4, QuickTime, AVI, Matroska or WebM.
         taken_at: frames/s at which the camera took them, where the stamps are known to be wrong (slow motion).
 
     Raises:
-        InputError: missing, empty or damaged file, no frame in it, a size or rate that cannot be, frames of different
-            sizes, a pause of over :data:`MAX_GAP`.
+        InputError: missing, empty or damaged file, no video in it, a codec that nothing installed decodes (named, with
+            what helps), a size or rate that cannot be, frames of different sizes, a pause of over :data:`MAX_GAP`.
     """
-    with _capture(path) as (capture, info):
-        first = last = None
-        count = 0
-        while True:
-            try:
-                ok, bgr = capture.read()
-            except cv2.error as error:
-                raise InputError(path, "video", f"cannot be decoded: {' '.join(str(error).split())}"[:200]) from None
-            if not ok:
-                break
-            stamp = capture.get(cv2.CAP_PROP_POS_MSEC) / 1000.0
-            if first is None or last is None:
-                first, time = stamp, 0.0
-            elif taken_at is not None:
-                time = count / taken_at
-            else:
-                time = stamp - first if stamp - first > last else last + 1.0 / info.fps
-                if time - last > MAX_GAP:
-                    cause = (
-                        f"no frame from {last:.3f} to {time:.3f} s: a pause of over {MAX_GAP:g} s, or damaged stamps"
-                    )
-                    raise InputError(path, "time stamps", cause)
-            last = time
-            count += 1
-            if bgr.shape != (info.height, info.width, 3):
-                raise InputError(path, "size", f"a frame of {bgr.shape[1]} x {bgr.shape[0]} among others: damaged")
-            yield time, cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB).astype(np.uint8, copy=False)
-        if first is None:
-            raise InputError(path, "video", "no frame can be decoded: the file is damaged")
+    first = last = None
+    for count, (stamp, frame, info) in enumerate(_decoded(path)):
+        if first is None or last is None:
+            first, time = stamp or 0.0, 0.0
+        elif taken_at is not None:
+            time = count / taken_at
+        else:
+            time = stamp - first if stamp is not None and stamp - first > last else last + 1.0 / info.fps
+            if time - last > MAX_GAP:
+                cause = f"no frame from {last:.3f} to {time:.3f} s: a pause of over {MAX_GAP:g} s, or damaged stamps"
+                raise InputError(path, "time stamps", cause)
+        last = time
+        if frame.shape != (info.height, info.width, 3):
+            raise InputError(path, "size", f"a frame of {frame.shape[1]} x {frame.shape[0]} among others: damaged")
+        yield time, frame
 
 
 def iter_frames(
@@ -204,7 +257,7 @@ def iter_frames(
     """The video's frames at the motion's times: frame k is the one nearest to video time ``k / fps + offset``.
 
     Args:
-        path: any MP4.
+        path: the video.
         fps: the motion's rate.
         offset: sync offset in seconds: what the motion shows at time t, the video shows at t + offset.
         count: number of motion frames; None takes every one until the video ends.

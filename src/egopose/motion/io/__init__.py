@@ -18,17 +18,27 @@ from egopose.motion.io.amass_writer import write_amass
 from egopose.motion.io.bvh import read_bvh
 from egopose.motion.io.bvh_writer import write_bvh
 from egopose.motion.io.c3d import write_c3d
+from egopose.motion.io.c3d_reader import read_c3d
 from egopose.motion.io.csv_table import write_csv
 from egopose.motion.io.deepmimic import read_deepmimic
 from egopose.motion.io.glb import write_glb
 from egopose.motion.io.mot import write_forces_mot, write_mot, write_torques_sto
+from egopose.motion.io.mvnx import read_mvnx
 from egopose.motion.io.native import read_native, write_native
 from egopose.motion.io.trc import write_trc
+from egopose.motion.io.trc_reader import read_trc
 from egopose.motion.motion import Motion
 
 __all__ = ["WRITERS", "read_motion", "write_motion", "writer_suffix"]
 
-_READERS: dict[str, Callable[..., Motion]] = {".bvh": read_bvh, ".amc": read_amc, ".txt": read_deepmimic}
+_READERS: dict[str, Callable[..., Motion]] = {
+    ".bvh": read_bvh,
+    ".amc": read_amc,
+    ".txt": read_deepmimic,
+    ".mvnx": read_mvnx,
+    ".trc": read_trc,
+    ".c3d": read_c3d,
+}
 
 #: How files of each ending are written; of two endings that fit a name the longer one counts.
 WRITERS: dict[str, Callable[..., None]] = {
@@ -49,7 +59,8 @@ def read_motion(path: str | Path, **options: Any) -> Motion:
     """Read a motion file; the suffix says how, and for ``.npz`` the arrays inside.
 
     Args:
-        path: ``.bvh`` (options ``unit``, ``up``), ``.amc`` (``asf``, ``fps``), ``.txt`` (DeepMimic), ``.npz`` (the
+        path: ``.bvh`` (options ``unit``, ``up``), ``.amc`` (``asf``, ``fps``), ``.txt`` (DeepMimic), ``.mvnx``
+            (Xsens; ``subject``), ``.trc`` and ``.c3d`` (points; ``unit``, ``up``, ``fps``, ``points``), ``.npz`` (the
             project's own clip, or AMASS with the option ``joints``).
         options: of that reader.
 

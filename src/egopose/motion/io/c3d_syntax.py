@@ -1,6 +1,10 @@
 """The C3D container: header, parameters, frames (The C3D File Format User Guide, Motion Lab Systems 2021; c3d.org).
 
 Little-endian (Intel), floating-point data, one analog sample a frame.
+
+Written here and not by ``ezc3d`` (1.7.2), which keeps 65,535 frames of a longer motion without a word: an hour at 30
+frames/s came back as 36 minutes. It took 570 MB where this takes 220, and 22 s and 5 GB for 70,000 frames of 300
+points. The tests read what is written here with it and with ``c3d``.
 """
 
 from __future__ import annotations

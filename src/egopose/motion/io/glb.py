@@ -3,6 +3,10 @@
 glTF 2.0 specification, sections 3.7.3 (skins), 3.11 (animations) and 4 (the binary container). Contacts, torques and
 forces of the ground have no place in glTF itself: they stand in accessors that the animation's ``extras`` name, which
 other programs carry along or leave alone.
+
+The container's two chunks are packed here and not by ``pygltflib`` (1.16.5): it would take the place of one method of
+nine lines, as accessors, views, bounds and padding are its user's too, for 90 ms of import and five more packages. The
+tests read what is written here with it.
 """
 
 from __future__ import annotations
