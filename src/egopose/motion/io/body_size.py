@@ -11,6 +11,7 @@ import re
 import numpy as np
 
 from egopose.motion.io.frames import UNITS
+from egopose.motion.joint_names import plain_names
 from egopose.motion.kinematics import forward_kinematics
 from egopose.motion.rotations import Array
 from egopose.motion.skeleton import Skeleton
@@ -72,7 +73,7 @@ def named(skeleton: Skeleton, part: str) -> list[int]:
     """Joints whose names speak of the ``"head"`` or a ``"foot"``: the first in the tree of each branch."""
     for pattern in _PATTERNS[part]:
         found: list[int] = []
-        for i, name in enumerate(skeleton.names):
+        for i, name in enumerate(plain_names(skeleton.names)):
             if re.search(pattern, name.lower()) and not set(_ancestors(skeleton, i)) & set(found):
                 found.append(i)
         if found:
