@@ -19,8 +19,6 @@ from egopose.motion.skeleton import Skeleton
 SIDES = ("right", "left")
 #: Helper bones that stand in a limb's chain in some rigs and carry no joint of their own.
 _HELPER = re.compile(r"twist|share|roll|helper|nub|(?:^|[_.:])ik[_.]|(?-i:(?<=\w)IK(?![a-z]))", re.IGNORECASE)
-    r"twist|share|roll|helper|nub|捩|補助|(?:^|[_.:])ik[_.]|(?-i:(?<=\w)(?:IK|ＩＫ)(?![a-z]))", re.IGNORECASE
-)
 _LIMB_PARTS = ("thigh", "shin", "foot", "toe", "clavicle", "arm", "forearm", "hand")
 _PARTS = ("hips", "neck", "head", *(f"{side}_{part}" for side in SIDES for part in _LIMB_PARTS))
 

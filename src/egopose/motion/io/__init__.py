@@ -96,9 +96,9 @@ def writer_suffix(path: Path) -> str:
 
 
 def _call(function: Callable[..., Any], path: Path, options: dict[str, Any], *arguments: Any) -> Any:
-    known = set(function.__kwdefaults__ or ())
-    unknown = sorted(set(options) - known)
+    known = list(function.__kwdefaults__ or ())
+    unknown = sorted(set(options) - set(known))
     if unknown:
-        has = f"has the options {', '.join(sorted(known))}" if known else "has no options"
+        has = f"has the options {', '.join(known)}" if known else "has no options"
         raise InputError(path, f"option {unknown[0]}", f"{function.__name__} {has}")
     return function(*arguments, **options)
