@@ -82,9 +82,8 @@ def read_bvh(
     sample = np.unique(np.linspace(0, len(raw.values) - 1, _GUESS_FRAMES).astype(int))
     skeleton, qpos = _assemble(raw.joints, [p.at(sample) for p in poses], folded, 1.0, up_rotation("z"), still=-1.0)
     height = stature(skeleton, forward_kinematics(skeleton, qpos)[0])
-    unit_name, metres = given or _guessed_unit(
-        path, height, sum(p.translation for p in poses[: folded + 1]), rate, notes
-    )
+    travel = np.sum([p.translation for p in poses[: folded + 1]], axis=0)
+    unit_name, metres = given or _guessed_unit(path, height, travel, rate, notes)
     low, high = _ANY_STATURE
     if not low <= height * metres <= high:
         cause = f"makes the body {height * metres:.3g} m tall ({height:.4g} units); {low} to {high} m are read"
