@@ -2,7 +2,7 @@
 
 The ending of each FILE says the format: .bvh .glb .amass.npz .trc .c3d .mot .forces.mot .torques.sto .csv .npz. Of an
 evaluation (a folder of `egopose evaluate`) every take is written; FILE then holds {take}. Further words are overrides
-of conf/export.yaml: options.up=z, part=reference, forces.enabled=false ...
+of conf/export.yaml: options.up=z, part=reference, forces.enabled=false, and for reading the motion reader.up=y ...
 """
 
 from __future__ import annotations
@@ -44,7 +44,8 @@ def run_export(source: Path, files: Sequence[str], config: Mapping[str, Any]) ->
         InputError: the source or a setting cannot be used, a file's ending is unknown, or the format cannot hold the
             motion; names it.
     """
-    from egopose.motion.io import WRITERS, read_motion, write_motion, writer_suffix
+    from egopose.motion.io import WRITERS, given_options, read_motion, write_motion, writer_suffix
+    from egopose.motion.notes import tell_notes
 
     if not files:
         raise InputError("export", "to", f"says no file; endings are {', '.join(WRITERS)}")
@@ -60,7 +61,8 @@ def run_export(source: Path, files: Sequence[str], config: Mapping[str, Any]) ->
     held = any(suffix in _HOLD_FORCES for suffix in suffixes.values())
     written = []
     for take, path in motions.items():
-        motion = read_motion(path)
+        motion = read_motion(path, **(given_options(config["reader"]) if path == source else {}))
+        tell_notes(take, motion, lambda line: print(line, file=sys.stderr))
         if enabled is not False and (needed or held) and motion.ground_reaction is None:
             motion = _with_forces(motion, source, config, required=needed or enabled is True)
         for file, suffix in suffixes.items():

@@ -26,12 +26,14 @@ def run_sync(config: Mapping[str, Any]) -> Sync:
         InputError: video, motion or a setting cannot be used, or no offset stands out; says what to do then.
     """
     from egopose.data.sync import settings_of, sync_offset
-    from egopose.motion.io import read_motion
+    from egopose.motion.io import given_options, read_motion
+    from egopose.motion.notes import tell_notes
     from egopose.vision.flow import FlowConfig
     from egopose.vision.lens import Camera
 
     camera = Camera.from_mapping(config["data"]["camera"], "data.camera")
-    motion = read_motion(str(config["motion"]), **config["reader"])
+    motion = read_motion(str(config["motion"]), **given_options(config["reader"]))
+    tell_notes(str(config["motion"]), motion, lambda line: print(line, file=sys.stderr))
     flow = FlowConfig(**config["vision"]["flow"])
     settings = settings_of(config["data"])
     return sync_offset(str(config["video"]), motion, settings, flow, camera, dict(config["mapping"]))

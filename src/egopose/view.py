@@ -2,7 +2,8 @@
 
 Sources: a motion file, a folder of an estimate, an evaluation's folder or a run directory; several are compared.
 Or `ws://127.0.0.1:8765/json`: what `egopose stream` sends, live.
-Words key=value are overrides of conf/sync.yaml (the camera), for `--offset auto` and the viewer's button Find.
+Words key=value are overrides of conf/sync.yaml: how motion files are read (reader.up=y) and, for `--offset auto` and
+the viewer's button Find, the camera.
 """
 
 from __future__ import annotations
@@ -64,6 +65,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     try:
         if find_spec("viser") is None:
             raise InputError("view", "viser", "is not installed; pip install 'egopose[view]'")
+        from egopose.config import compose_config
+        from egopose.motion.io import given_options
+        from egopose.motion.notes import tell_notes
         from egopose.viewer.app import Viewer
         from egopose.viewer.clip import Footage
         from egopose.viewer.door import Address
@@ -88,7 +92,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
         else:
             if footage is not None:
                 probe_video(footage.path)
-            viewer = Viewer(read_runs(sources, footage), address, find_sync, overrides)
+            reader = compose_config("sync", ["video=-", "motion=-", *overrides])["reader"]
+            runs = read_runs(sources, footage, given_options(reader))
+            for run in runs:
+                for name, clip in run.clips.items():
+                    tell_notes(name, clip.motion, lambda line: print(line, file=sys.stderr))
+            viewer = Viewer(runs, address, find_sync, overrides)
     except InputError as error:
         print(f"error: {error}", file=sys.stderr)
         raise SystemExit(2) from None

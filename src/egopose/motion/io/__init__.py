@@ -6,7 +6,7 @@ Every reader gives a :class:`~egopose.motion.motion.Motion`: z up, metres, radia
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +26,7 @@ from egopose.motion.io.native import read_native, write_native
 from egopose.motion.io.trc import write_trc
 from egopose.motion.motion import Motion
 
-__all__ = ["WRITERS", "read_motion", "write_motion", "writer_suffix"]
+__all__ = ["WRITERS", "given_options", "read_motion", "write_motion", "writer_suffix"]
 
 _READERS: dict[str, Callable[..., Motion]] = {".bvh": read_bvh, ".amc": read_amc, ".txt": read_deepmimic}
 
@@ -49,8 +49,9 @@ def read_motion(path: str | Path, **options: Any) -> Motion:
     """Read a motion file; the suffix says how, and for ``.npz`` the arrays inside.
 
     Args:
-        path: ``.bvh`` (options ``unit``, ``up``), ``.amc`` (``asf``, ``fps``), ``.txt`` (DeepMimic), ``.npz`` (the
-            project's own clip, or AMASS with the option ``joints``).
+        path: ``.bvh`` (options ``unit``, ``up``, ``fps``, ``encoding``), ``.amc`` (these and ``asf``), ``.txt``
+            (DeepMimic: ``up``, ``fps``, ``encoding``), ``.npz`` (the project's own clip, or AMASS and SMPL with
+            ``joints``, ``up``, ``fps``).
         options: of that reader.
 
     Raises:
@@ -65,6 +66,11 @@ def read_motion(path: str | Path, **options: Any) -> Motion:
     if reader is None:
         raise InputError(path, "suffix", f"no reader for {suffix!r}; there is one for {', '.join([*_READERS, '.npz'])}")
     return _call(reader, path, options, path)
+
+
+def given_options(reader: Mapping[str, Any]) -> dict[str, Any]:
+    """Of a resolved ``conf/reader`` group what was given: options for :func:`read_motion`."""
+    return {name: value for name, value in reader.items() if value is not None}
 
 
 def write_motion(motion: Motion, path: str | Path, **options: Any) -> None:

@@ -15,7 +15,10 @@ from egopose.errors import InputError
 from egopose.motion import rotations as rot
 from egopose.motion.io._files import excerpt
 from egopose.motion.io.acclaim_syntax import AsfFile, parse_amc, parse_asf
+from egopose.motion.io.body_size import stature
+from egopose.motion.io.body_unit import STATURE_RANGE, guess_unit
 from egopose.motion.io.frames import continuous_euler, given_rate, given_unit, given_up, up_rotation
+from egopose.motion.kinematics import forward_kinematics
 from egopose.motion.motion import Motion
 from egopose.motion.rotations import Array
 from egopose.motion.skeleton import Dof, Joint, Skeleton
@@ -73,8 +76,25 @@ def read_amc(
         "unit": "asf" if given is None else given[0],
         "unit_metres": skeleton_file.metres,
         "up": up,
+        "notes": notes,
     }
     return Motion(skeleton, qpos, rate, name=path.stem, meta=meta)
+
+
+def _other_unit(asf: AsfFile, skeleton: Skeleton, notes: list[str]) -> tuple[str, float] | None:
+    """The likeliest unit where the one that the skeleton states makes it no person's; else None."""
+    height = stature(skeleton, forward_kinematics(skeleton, skeleton.rest_qpos()[None])[0])
+    low, high = STATURE_RANGE
+    if low <= height <= high:
+        return None
+    guess = guess_unit(height / asf.metres, np.zeros((1, 3)), 1.0)
+    if guess is None:
+        return None
+    notes.append(
+        f"the skeleton states a unit that makes it {height:.2f} m tall; {guess.name} is taken: "
+        f"{height / asf.metres * guess.metres:.2f} m; reader.unit says otherwise"
+    )
+    return guess.name, guess.metres
 
 
 def _find_asf(path: Path) -> Path:
