@@ -62,9 +62,7 @@ def without_lead_in(motion: Motion) -> Motion:
     for count, where in ((before, "before"), (after, "after")):
         if count:
             frames = "a frame" if count == 1 else f"{count} frames"
-            motion = with_note(
-                motion, f"{frames} of a still pose {where} the motion were cut: it does not belong to it"
-            )
+            motion = with_note(motion, f"{frames} of a still pose {where} the motion were cut: they do not belong")
     return motion.slice(before, len(motion) - after) if before or after else motion
 
 

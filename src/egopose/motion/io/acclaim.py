@@ -55,10 +55,13 @@ def read_amc(
     up = "y" if given_up(path, up) == "auto" else up
     asf_path = _find_asf(path) if asf is None else Path(asf)
     skeleton_file = parse_asf(asf_path, encoding)
-    if given is not None:
-        skeleton_file = skeleton_file.in_unit(given[1])
     frames, columns, degrees = parse_amc(path, skeleton_file, encoding)
     skeleton, dof_columns = _skeleton(asf_path, skeleton_file, columns)
+    notes: list[str] = []
+    given = given or _other_unit(skeleton_file, skeleton, notes)
+    if given is not None:
+        skeleton_file = skeleton_file.in_unit(given[1])
+        skeleton, dof_columns = _skeleton(asf_path, skeleton_file, columns)
 
     scale = np.pi / 180.0 if degrees else 1.0
     root = frames[:, : len(skeleton_file.root_order)]

@@ -22,8 +22,11 @@ _ADULT, _SPREAD, _CHILDREN, _CHILD_RANGE = 1.7, 0.15, 0.05, (0.65, 1.5)
 #: second: in flight it is 9.8, pushing off about twice that.
 _SPEED, _ACCELERATION = 10.0, 25.0
 
+#: What is told besides: a body outside these statures (m), and a unit that fewer files are in than this.
+_USUAL, _RARE = (1.4, 2.1), 0.05
+
 #: A unit with more than this share of the best one's likelihood is named beside it.
-_RIVAL = 0.05
+_RIVAL = 0.1
 
 
 @dataclass(frozen=True)
@@ -43,8 +46,9 @@ def guess_unit(height: float, root: Array, fps: float) -> UnitGuess | None:
         root: ``[T, 3]`` positions of the hips in units.
         fps: frames per second.
     """
-    low, high = STATURE_RANGE
-    possible = {unit: metres for unit, metres in UNITS.items() if low <= height * metres <= high}
+    possible = {
+        unit: metres for unit, metres in UNITS.items() if STATURE_RANGE[0] <= height * metres <= STATURE_RANGE[1]
+    }
     if not possible:
         return None
     speed, acceleration = _quickest(root, fps)
@@ -56,14 +60,14 @@ def guess_unit(height: float, root: Array, fps: float) -> UnitGuess | None:
     }
     best, *others = sorted(score, key=lambda unit: -score[unit])
     rivals = [unit for unit in others if score[unit] > score[best] + np.log(_RIVAL)]
-    doubt = ""
+    doubt, (low, high) = "", _USUAL
     if rivals:
         other = " or ".join(f"{height * UNITS[u]:.2f} m in {u}" for u in rivals)
         doubt = (
             f"lengths are taken for {best}: a body of {height * UNITS[best]:.2f} m; it could be of {other}: "
             f"reader.unit={rivals[0]}"
         )
-    elif not 1.4 <= height * UNITS[best] <= 2.1:
+    elif _CUSTOM[best] < _RARE or not low <= height * UNITS[best] <= high:
         doubt = f"lengths are taken for {best}: a body of {height * UNITS[best]:.2f} m; reader.unit says otherwise"
     return UnitGuess(best, UNITS[best], doubt)
 
