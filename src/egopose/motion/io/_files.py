@@ -108,6 +108,18 @@ def _decoded_otherwise(raw: bytes) -> str | None:
     return None
 
 
+def numbers_apart(line: str, count: int) -> list[str]:
+    """The line's numbers where some have no blank between them, as columns of a fixed width have.
+
+    A sign within a word begins a number, unless it is of an exponent. Where that does not give ``count``, all must have
+    as many decimals as the line's last number. What still is not ``count`` words is left for the caller to refuse.
+    """
+    words = re.sub(r"(?<=[0-9.])(?=[-+])", " ", line).split()
+    if len(words) < count and (match := re.search(r"\.([0-9]+)\s*$", line)):
+        words = re.findall(rf"[-+]?[0-9]*\.[0-9]{{{len(match[1])}}}|[^\s]+", line)
+    return words
+
+
 def check_values(path: Path, field: str, frames: int, columns: int) -> None:
     """Raises InputError where a motion is too long to be held: more than :data:`MAX_VALUES` numbers."""
     if frames * columns > MAX_VALUES:

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from egopose.errors import InputError
-from egopose.motion.io._files import MAX_JOINTS, check_values, excerpt, read_text
+from egopose.motion.io._files import MAX_JOINTS, check_values, excerpt, numbers_apart, read_text
 from egopose.motion.rotations import Array
 
 _MAX_VALUE = 1e7
@@ -235,6 +235,8 @@ def parse_amc(path: Path, asf: AsfFile, encoding: str = "auto") -> tuple[Array, 
 
 
 def _floats(path: Path, number: int, words: list[str], count: int) -> Array:
+    if len(words) < count:
+        words = numbers_apart(" ".join(words), count)
     try:
         values = np.array([float(w) for w in words])
     except ValueError:

@@ -79,7 +79,7 @@ def _stature_density(stature: float) -> float:
 
 
 def _quickest(root: Array, fps: float) -> tuple[float, float]:
-    """Speed and acceleration over tenths of a second that 98 % of the frames stay under."""
+    """Speed and acceleration over tenths of a second that four fifths of the frames stay under."""
     step = max(1, round(0.1 * fps))
     if len(root) <= 2 * step:
         return 0.0, 0.0
@@ -89,7 +89,7 @@ def _quickest(root: Array, fps: float) -> tuple[float, float]:
 
 
 def _most(vectors: Array) -> float:
-    return float(np.percentile(np.linalg.norm(vectors, axis=1), 98))
+    return float(np.percentile(np.linalg.norm(vectors, axis=1), 80))
 
 
 def _excess(ratio: float) -> float:

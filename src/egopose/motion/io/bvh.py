@@ -125,11 +125,10 @@ class _LocalPose:
 
 
 def _local_poses(raw: BvhFile, notes: list[str]) -> list[_LocalPose]:
-    poses, columns = [], _columns(raw.joints)
-    added = _added_to_offsets(raw, columns)
-    if added:
+    poses, columns, added = [], _columns(raw.joints), _added_to_offset(raw)
+    if any(added):
         notes.append("positions of joints below the root are added to OFFSET, as their values say")
-    for joint, column in zip(raw.joints, columns, strict=True):
+    for joint, column, adds in zip(raw.joints, columns, added, strict=True):
         channels = joint.channels or ()
         values = raw.values[:, column : column + len(channels)]
         offset = np.array(joint.offset)
@@ -138,7 +137,7 @@ def _local_poses(raw: BvhFile, notes: list[str]) -> list[_LocalPose]:
         for k, channel in enumerate(channels):
             if channel.endswith("position"):
                 axis = "xyz".index(channel[0])
-                translation[:, axis] = values[:, k] + (offset[axis] if added and joint.parent >= 0 else 0.0)
+                translation[:, axis] = values[:, k] + (offset[axis] if adds else 0.0)
         axes = "".join(channels[k][0] for k in turning)
         angles = np.deg2rad(values[:, turning])
         angles = continuous_euler(angles) if len(set(axes)) == 3 else np.unwrap(angles, axis=0)
@@ -151,25 +150,23 @@ def _columns(joints: list[BvhJoint]) -> list[int]:
     return [0, *itertools.accumulate(len(joint.channels or ()) for joint in joints)][:-1]
 
 
-def _added_to_offsets(raw: BvhFile, columns: list[int]) -> bool:
-    """Whether position channels below the root say what is added to OFFSET, rather than what replaces it.
+def _added_to_offset(raw: BvhFile) -> list[bool]:
+    """For each joint, whether its position channels say what is added to OFFSET, rather than what replaces it.
 
-    Bones hardly change their length: over all such joints the values stay near the OFFSETs where they replace them, and
-    near nothing where they are added. A joint that the first joint of the body may be (no joint above it has an OFFSET
-    or a sibling) does not vote: its place in the world is no bone.
+    Bones hardly change their length: over all joints the values stay near the OFFSETs where they replace them, and near
+    nothing where they are added. The body's first joint and those above it have their place in the world: they do not
+    vote, and where the others' are added each is taken for what fits its own values.
     """
-    replaced = added = 0.0
-    body = _first_branching(raw.joints)
-    for i, joint in enumerate(raw.joints):
-        channels = joint.channels or ()
-        if i <= body:
-            continue
-        for k, channel in enumerate(channels):
+    misfits = np.zeros((len(raw.joints), 2))  # were they added; did they replace
+    for i, (joint, column) in enumerate(zip(raw.joints, _columns(raw.joints), strict=True)):
+        for k, channel in enumerate(joint.channels or ()):
             if channel.endswith("position"):
-                middle = float(np.median(raw.values[:, columns[i] + k]))
-                replaced += abs(middle - np.array(joint.offset)["xyz".index(channel[0])])
-                added += abs(middle)
-    return added < replaced
+                middle = float(np.median(raw.values[:, column + k]))
+                misfits[i] += abs(middle), abs(middle - np.array(joint.offset)["xyz".index(channel[0])])
+    body = _first_branching(raw.joints)
+    added, replaced = misfits[body + 1 :].sum(axis=0)
+    own = misfits[:, 0] < misfits[:, 1]
+    return [bool(added < replaced and (i > body or own[i])) for i in range(len(raw.joints))]
 
 
 def _first_branching(joints: list[BvhJoint]) -> int:

@@ -15,10 +15,11 @@ from pathlib import Path
 import numpy as np
 
 from egopose.errors import InputError
-from egopose.motion.io._files import MAX_JOINTS, check_values, excerpt, read_text
+from egopose.motion.io._files import MAX_JOINTS, check_values, excerpt, numbers_apart, read_text
 from egopose.motion.rotations import Array
 
 _MOTION = re.compile(r"^[ \t]*MOTION[ \t]*$", re.MULTILINE | re.IGNORECASE)
+_EXPECTED = "expected JOINT, End Site, OFFSET, CHANNELS, '{' or '}'"
 _END = ("END", "ENDSITE", "END_SITE", "END-SITE")
 _COMMENT = ("#", "//", ";")
 _FIELD = re.compile(r"(frames|frame[ \t_]*time)[ \t]*(:|[ \t])[ \t]*(.*)", re.IGNORECASE)
@@ -153,7 +154,7 @@ def _parse_hierarchy(path: Path, text: str, end: int) -> list[BvhJoint]:
             elif key == "OFFSET":
                 cut = tokens.index("}") if "}" in tokens else len(tokens)
                 if cut < 3:  # minus signs may stand for blanks
-                    tokens = [*_apart(" ".join(tokens[:cut]), 3), *tokens[cut:]]
+                    tokens = [*numbers_apart(" ".join(tokens[:cut]), 3), *tokens[cut:]]
                 offset, tokens = _numbers(path, where, "OFFSET", tokens, 3), tokens[3:]
                 if not stack:
                     raise InputError(path, where, "OFFSET outside a joint")
@@ -184,7 +185,7 @@ def _parse_hierarchy(path: Path, text: str, end: int) -> list[BvhJoint]:
                     raise InputError(path, where, "a channel stands twice")
                 joints[stack[-1]].channels = channels
             else:
-                raise InputError(path, where, f"unknown word {excerpt(word)} in the hierarchy")
+                raise InputError(path, where, f"unknown word {excerpt(word)} in the hierarchy: {_EXPECTED}")
     where = f"line {number}"
     if not joints:
         raise InputError(path, where, "no ROOT joint before MOTION")
@@ -292,7 +293,7 @@ def _parse_frames(
                 cause = f"more than the {frames} frames announced (if they belong to it, correct 'Frames:')"
                 raise InputError(path, f"line {number}", cause)
             if count != n_channels:
-                words = _apart(line, n_channels)
+                words = numbers_apart(line, n_channels)
                 if len(words) != n_channels:
                     cause = f"frame {rows} of {frames} has {count} numbers, the hierarchy has {n_channels} channels"
                     raise InputError(path, f"line {number}", cause)
@@ -314,18 +315,6 @@ def _parse_frames(
     if values.size != rows * n_channels or not (np.abs(values) < _MAX_VALUE).all():
         _blame(path, text, start, first_line)
     return values.reshape(rows, n_channels)
-
-
-def _apart(line: str, count: int) -> list[str]:
-    """The line's numbers where some have no blank between them, as columns of a fixed width have.
-
-    A sign within a word begins a number, unless it is of an exponent. Where that does not give ``count``, all must have
-    as many decimals as the line's last number. What still is not ``count`` words is left for the caller to refuse.
-    """
-    words = re.sub(r"(?<=[0-9.])(?=[-+])", " ", line).split()
-    if len(words) < count and (match := re.search(r"\.([0-9]+)\s*$", line)):
-        words = re.findall(rf"[-+]?[0-9]*\.[0-9]{{{len(match[1])}}}|[^\s]+", line)
-    return words
 
 
 def _blame(path: Path, text: str, start: int, first_line: int) -> None:
