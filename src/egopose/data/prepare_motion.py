@@ -21,7 +21,7 @@ from egopose.motion.rotations import Array
 from egopose.motion.settle import SettleSettings, settle
 
 #: m: what a leap into the motion is, what a held pose may sway by, and what no recording keeps within.
-_LEAP, _STILL, _FROZEN = 0.15, 0.02, 1e-4
+_LEAP, _STILL, _FROZEN = 0.15, 0.05, 1e-4
 
 #: Width over height of the joints in a T-pose; a body of usual proportions has 0.9, with its arms at 45 degrees 0.65.
 _WIDE = 0.75

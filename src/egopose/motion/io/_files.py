@@ -68,7 +68,7 @@ def _decoded(path: Path, raw: bytes, encoding: str) -> str:
         encoding = "utf-16" if raw.startswith(_UTF_16) else "utf-8-sig"
     else:
         try:
-            b"".decode(encoding)
+            "a".encode(encoding)
         except (LookupError, ValueError, TypeError):
             raise InputError(path, "option encoding", f"{excerpt(str(encoding))} is no encoding of text") from None
     zero = -1 if re.match("utf.?(16|32)", encoding, re.IGNORECASE) else raw.find(b"\0")
