@@ -68,7 +68,7 @@ def parts_positions(motion: Motion, frames: int = 12) -> Array:
     """``[frames, J, 3]`` m: the humanoid's joints with some of the motion's frames retargeted to it."""
     at = np.linspace(0, len(motion) - 1, frames).astype(int)
     humanoid = default_humanoid()
-    part = replace(motion, qpos=motion.qpos[at], fps=30.0)
+    part = replace(motion, qpos=motion.qpos[at])
     return retarget(part, humanoid.skeleton, humanoid.joint_range)[0].forward_kinematics()[0]
 
 
