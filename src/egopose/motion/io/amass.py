@@ -106,7 +106,8 @@ def read_amass(
     if up == "auto":
         ankles = (skeleton.index("left_ankle"), skeleton.index("right_ankle"))
         moved = bool(np.abs(arrays.place[0]).max() < _MOVED)
-        up = guess_up(forward_kinematics(skeleton, qpos)[0], skeleton.index("head"), ankles, moved)
+        usual = forward_kinematics(_skeleton(rest_positions()), qpos)[0]  # given joints may be of anything
+        up = guess_up(usual, skeleton.index("head"), ankles, moved)
         if up != "z":
             notes.append(f"{up} is taken for up: the body stands along it; reader.up says otherwise")
     to_z_up = up_rotation(up)
