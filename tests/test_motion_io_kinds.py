@@ -14,7 +14,12 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from motion_files import Bvh, parts_positions, plain
 
+from egopose import export
+from egopose.config import compose_config
+from egopose.data.preparation import prepare
 from egopose.data.prepare_motion import without_lead_in
+from egopose.data.report import store_report
+from egopose.data.store import TakeStore
 from egopose.errors import InputError
 from egopose.motion import rotations as rot
 from egopose.motion.io import read_motion
@@ -24,6 +29,7 @@ from egopose.motion.mapping import identify
 from egopose.motion.motion import Motion
 from egopose.motion.notes import notes_of
 from egopose.motion.rotations import Array
+from egopose.viewer.sources import read_run
 
 MANY = settings(
     max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow]
@@ -656,3 +662,56 @@ def test_arrays_that_do_not_fit_are_named(smpl: dict[str, Array], tmp_path: Path
             read_motion(save(tmp_path, **{**good, **change}), fps=30)
     with pytest.raises(InputError, match="poses: missing: an AMASS or SMPL file holds poses, or root_orient"):
         read_motion(save(tmp_path, transl=smpl["trans"], body_pose=good["body_pose"]), fps=30)
+
+
+# --- what the commands pass on and tell ------------------------------------------------------------------------------
+
+
+def test_prepare_passes_reader_options_on_and_tells_the_notes(
+    squat: Bvh, smpl: dict[str, Array], tmp_path: Path
+) -> None:
+    rows = np.concatenate([t_pose(squat)[None], squat.rows[:40]])
+    (tmp_path / "led.bvh").write_text(replace(squat, rows=rows, frame_time="0.033").text(announced=40))
+    poses, trans = smpl["poses"][:60], smpl["trans"][:60]
+    np.savez(tmp_path / "timeless.npz", poses=poses, trans=trans)
+    takes = f"[{{motion: {tmp_path}/led.bvh}}, {{motion: {tmp_path}/timeless.npz, reader: {{fps: 60}}}}]"
+    overrides = ["data=own", f"data.takes={takes}", f"data.store={tmp_path}/store", "data.reader.up=y", "sim=fast"]
+    with pytest.raises(InputError, match=r"fps: 'x' is not a frame rate"):
+        prepare(compose_config("prepare", [*overrides, "data.reader.fps=x"]), progress=False, flow=False)
+    store = prepare(compose_config("prepare", overrides), progress=False, flow=False)
+    assert [take.length for take in store.takes] == [40, 30]
+    assert store.clip(0).meta["up"] == store.clip(1).meta["up"] == "y"
+    lines = store_report(TakeStore.open(store.root)).splitlines()
+    told = [line for line in lines if line.startswith("led: ")]
+    assert told == [f"led: {note}" for note in notes_of(store.clip(0))]
+    assert len(told) == 3
+    assert "40 frames are announced and 41 are there" in told[0]
+    assert "a frame of a still pose before the motion" in told[2]
+
+
+def test_export_and_view_read_with_options_and_tell(
+    squat: Bvh, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "a.bvh"
+    path.write_text(replace(squat, frame_time="0.033").text())
+    monkeypatch.setattr("sys.argv", ["export", str(path), f"to={tmp_path}/b.csv", "reader.unit=m", "reader.up=z"])
+    with pytest.raises(SystemExit):
+        export.main()
+    assert "option unit: makes the body 170 m tall" in capsys.readouterr().err
+    monkeypatch.setattr(
+        "sys.argv", ["export", str(path), f"to={tmp_path}/b.npz", "reader.up=z", "forces.enabled=false"]
+    )
+    export.main()
+    assert "a: the frame time 0.033 s is taken for 30 frames/s" in capsys.readouterr().err
+    assert read_motion(tmp_path / "b.npz").meta["up"] == "z"
+    clip = read_run(path, reader={"up": "z", "fps": 25}).clips["a"].motion
+    assert (clip.fps, clip.meta["up"]) == (25, "z")
+
+
+def test_notes_of_a_clip_from_elsewhere_are_short_lines_of_text(expected: Motion) -> None:
+    strange = replace(expected, meta={"notes": ["a\nb", 3, None, "c" * 1000, *["d"] * 50]})
+    assert notes_of(strange)[0] == "a b"
+    assert max(map(len, notes_of(strange))) == 300
+    assert len(notes_of(strange)) < 30
+    for meta in ({}, {"notes": "text"}, {"notes": {"a": 1}}):
+        assert notes_of(replace(expected, meta=meta)) == ()

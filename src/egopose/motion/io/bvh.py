@@ -73,9 +73,7 @@ def read_bvh(
     notes = list(raw.notes)
     rate = frame_rate(raw.frame_time) if fps is None else given_rate(path, fps)
     if fps is None and abs(rate * float(raw.frame_time) - 1.0) > 5e-4:
-        notes.append(
-            f"the frame time {raw.frame_time} s is a rounded one: {rate:g} frames/s; reader.fps says otherwise"
-        )
+        notes.append(f"the frame time {raw.frame_time} s is taken for {rate:g} frames/s; reader.fps says otherwise")
     poses = _local_poses(raw, notes)
     folded = _fold_carriers(raw.joints, poses)
 
