@@ -16,7 +16,7 @@ import numpy as np
 
 from egopose.errors import InputError
 from egopose.motion import rotations as rot
-from egopose.motion.io.body_size import guess_up, stature
+from egopose.motion.io.body_size import guess_up, named, stature
 from egopose.motion.io.body_unit import STATURE_RANGE, guess_unit
 from egopose.motion.io.bvh_syntax import BvhFile, BvhJoint, parse_bvh
 from egopose.motion.io.frames import (
@@ -35,6 +35,9 @@ from egopose.motion.skeleton import Joint, Skeleton, hinges, slides
 #: Translations that stay within this of their middle (m) are a bone's length, not a movement.
 _STILL = 5e-5
 _GUESS_FRAMES = 60
+
+#: Share of the misfit that is left where positions are added to OFFSET; bones that stretch leave a twentieth.
+_CLEARLY = 0.2
 
 #: m; what a unit that was asked for may make of a body: puppets and giants too, but not what is a wrong unit.
 _ANY_STATURE = (0.1, 20.0)
@@ -83,7 +86,7 @@ def read_bvh(
     travel = np.sum([p.translation for p in poses[: folded + 1]], axis=0)
     unit_name, metres = given or _guessed_unit(path, height, travel, rate, notes)
     low, high = _ANY_STATURE
-    if not low <= height * metres <= high:
+    if not low <= height * metres <= high and named(skeleton, "head") and named(skeleton, "foot"):
         cause = f"makes the body {height * metres:.3g} m tall ({height:.4g} units); {low} to {high} m are read"
         raise InputError(path, "option unit", cause)
     up = guess_up(skeleton, qpos) if up == "auto" else up
@@ -152,19 +155,20 @@ def _added_to_offset(raw: BvhFile) -> list[bool]:
     """For each joint, whether its position channels say what is added to OFFSET, rather than what replaces it.
 
     Bones hardly change their length: over all joints the values stay near the OFFSETs where they replace them, and near
-    nothing where they are added. The body's first joint and those above it have their place in the world: they do not
-    vote, and where the others' are added each is taken for what fits its own values.
+    nothing where they are added. What is neither is taken for the usual, which is to replace. The body's first joint
+    and those above it have their place in the world: they do not vote, and where the others' are added each is taken
+    for what fits its own values.
     """
     misfits = np.zeros((len(raw.joints), 2))  # were they added; did they replace
     for i, (joint, column) in enumerate(zip(raw.joints, _columns(raw.joints), strict=True)):
         for k, channel in enumerate(joint.channels or ()):
             if channel.endswith("position"):
-                middle = float(np.median(raw.values[:, column + k]))
-                misfits[i] += abs(middle), abs(middle - np.array(joint.offset)["xyz".index(channel[0])])
+                values, offset = raw.values[:, column + k], np.array(joint.offset)["xyz".index(channel[0])]
+                misfits[i] += np.percentile(np.abs(values), 90), np.percentile(np.abs(values - offset), 90)
     body = _first_branching(raw.joints)
     added, replaced = misfits[body + 1 :].sum(axis=0)
     own = misfits[:, 0] < misfits[:, 1]
-    return [bool(added < replaced and (i > body or own[i])) for i in range(len(raw.joints))]
+    return [bool(added < _CLEARLY * replaced and (i > body or own[i])) for i in range(len(raw.joints))]
 
 
 def _first_branching(joints: list[BvhJoint]) -> int:
