@@ -2,7 +2,7 @@
 
 The ending of each FILE says the format: .bvh .glb .amass.npz .trc .c3d .mot .forces.mot .torques.sto .csv .npz. Of an
 evaluation (a folder of `egopose evaluate`) every take is written; FILE then holds {take}. Further words are overrides
-of conf/export.yaml: options.up=z, part=reference, forces.enabled=false ...
+of conf/export.yaml: options.up=z, part=reference, forces.enabled=false, and for reading the motion reader.up=y ...
 """
 
 from __future__ import annotations

@@ -2,7 +2,8 @@
 
 Sources: a motion file, a folder of an estimate, an evaluation's folder or a run directory; several are compared.
 Or `ws://127.0.0.1:8765/json`: what `egopose stream` sends, live.
-Words key=value are overrides of conf/sync.yaml (the camera), for `--offset auto` and the viewer's button Find.
+Words key=value are overrides of conf/sync.yaml: how motion files are read (reader.up=y) and, for `--offset auto` and
+the viewer's button Find, the camera.
 """
 
 from __future__ import annotations

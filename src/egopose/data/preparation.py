@@ -25,6 +25,7 @@ from egopose.humanoid.config import HumanoidConfig, SimConfig
 from egopose.humanoid.model import HumanoidModel, build_humanoid
 from egopose.motion.io import read_motion
 from egopose.motion.motion import Motion
+from egopose.motion.notes import notes_of
 from egopose.motion.retarget import RetargetReport
 from egopose.vision.corruption import Corruption
 from egopose.vision.features import extract_flow
@@ -34,7 +35,7 @@ from egopose.vision.takes import RenderConfig, RenderJob, render_takes
 
 #: Raise it whenever changed code gives another reference, video or flow for unchanged settings and sources: reading of
 #: motion files, retargeting, settling, making of the humanoid, rendering, optical flow. Stores are then made anew.
-PREPARATION_VERSION = 2
+PREPARATION_VERSION = 3
 
 
 def humanoid_of(config: Mapping[str, Any]) -> HumanoidModel:
@@ -159,6 +160,7 @@ def _row(
         supported=runs_of(feasible),
         retargeting_mm=float(np.mean([mean for mean, _ in report.position_mm.values()])),
         camera=asdict(source.camera) if source.camera else None,
+        notes=notes_of(clip),
     )
 
 

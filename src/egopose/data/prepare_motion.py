@@ -16,7 +16,15 @@ from egopose.motion import rotations as rot
 from egopose.motion.foot_contact_ik import plant_feet
 from egopose.motion.ground_alignment import GroundAlignmentSettings, align_to_ground
 from egopose.motion.motion import Motion
+from egopose.motion.notes import with_note
 from egopose.motion.retarget import RetargetReport, retarget
+from egopose.motion.rotations import Array
+
+#: m: what a leap into the motion is, what a held pose may sway by, and what no recording keeps within.
+_LEAP, _STILL, _FROZEN = 0.15, 0.05, 1e-4
+
+#: Width over height of the joints in a T-pose; a body of usual proportions has 0.9, with its arms at 45 degrees 0.65.
+_WIDE = 0.75
 
 
 @dataclass(frozen=True)
@@ -38,16 +46,61 @@ class PreparationSettings:
 
 
 def without_lead_in(motion: Motion) -> Motion:
-    """The motion without a first frame that is not of it: many exports begin with a T-pose.
+    """The motion without still poses before and after it that are not of it: many exports begin with a T-pose.
 
-    It is told by its jump: some joint moves further into frame 1 than 0.15 m and five times as far as it usually does.
+    Such a pose is told by the leap between it and the motion: in one frame some joint moves further than 0.15 m, five
+    times as far as it usually does, and twice as far as in the next frame. Who stands in a T-pose and moves out of it
+    makes no leap. Several frames must besides be frozen, as no recording is, or a T-pose. What was cut is noted in
+    ``meta["notes"]``.
     """
     if len(motion) < 3:
         return motion
     positions, _ = motion.forward_kinematics()
     local = positions - positions[:, :1]
-    jumps = np.linalg.norm(np.diff(local, axis=0), axis=2).max(axis=1)
-    return motion.slice(1, len(motion)) if jumps[0] > max(0.15, 5 * np.median(jumps[1:])) else motion
+    before = _still_frames(local)
+    after = _still_frames(local[before:][::-1])
+    for count, where in ((before, "before"), (after, "after")):
+        if count:
+            frames = "a frame" if count == 1 else f"{count} frames"
+            motion = with_note(motion, f"{frames} of a still pose {where} the motion were cut: they do not belong")
+    return motion.slice(before, len(motion) - after) if before or after else motion
+
+
+def _still_frames(local: Array) -> int:
+    """How many frames at the beginning are a pose that the motion leaps out of.
+
+    Args:
+        local: ``[T, J, 3]`` positions of the joints less the root's (m, z up).
+    """
+    start = 0
+    while len(local) - start > 2:
+        rest = local[start:]
+        leaves = np.linalg.norm(rest - rest[0], axis=2).max(axis=1) > _STILL
+        count = int(np.argmax(leaves)) if leaves.any() else 0
+        if not count or not _leaps(rest[count - 1 :]):
+            break
+        held, motion = rest[:count], rest[count:]
+        t_pose = _is_t_pose(held[0])
+        if count > 1 and not t_pose and np.abs(held - held[0]).max() > _FROZEN:
+            break
+        if count >= len(motion) and not (t_pose and not _is_t_pose(motion[len(motion) // 2])):
+            break
+        start += count
+    return start
+
+
+def _leaps(local: Array) -> bool:
+    """Whether the first step is a leap beside all others."""
+    steps = np.linalg.norm(np.diff(local, axis=0), axis=2).max(axis=1)
+    usual, following = (float(np.median(steps[1:])), float(steps[1])) if len(steps) > 1 else (0.0, 0.0)
+    return bool(steps[0] > max(_LEAP, 5 * usual, 2 * following))
+
+
+def _is_t_pose(local: Array) -> bool:
+    """Whether the body is about as wide as it is high."""
+    ground = local[:, :2]
+    width = np.linalg.norm(ground[:, None] - ground[None], axis=2).max()
+    return bool(width > _WIDE * np.ptp(local[:, 2]))
 
 
 def low_pass(motion: Motion, cutoff_hz: float) -> Motion:

@@ -54,6 +54,7 @@ class TakeInfo:
         supported: ``[[start, stop], ...]`` frames in which a body on a bare floor could be in.
         retargeting_mm: mean distance of the retargeted joints to their source, mm.
         camera: settings of :class:`egopose.vision.lens.Camera` of a user's own video, or None.
+        notes: sentences on how its motion file was read.
     """
 
     name: str
@@ -68,6 +69,7 @@ class TakeInfo:
     supported: tuple[tuple[int, int], ...]
     retargeting_mm: float
     camera: Any = None
+    notes: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)

@@ -8,6 +8,7 @@ the answer, refined between frames by a parabola.
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from os import PathLike
@@ -20,9 +21,10 @@ from egopose.core.config import from_mapping
 from egopose.core.errors import InputError
 from egopose.data.prepare_motion import without_lead_in
 from egopose.motion import rotations as rot
-from egopose.motion.io import read_motion
+from egopose.motion.io import given_options, read_motion
 from egopose.motion.mapping import identify
 from egopose.motion.motion import Motion
+from egopose.motion.notes import tell_notes
 from egopose.motion.rotations import Array
 from egopose.vision.camera_rotation import camera_rotation
 from egopose.vision.flow import FlowConfig, flow_of_frames
@@ -235,7 +237,8 @@ def run_sync(config: Mapping[str, Any]) -> Sync:
         InputError: video, motion or a setting cannot be used, or no offset stands out; says what to do then.
     """
     camera = Camera.from_mapping(config["data"]["camera"], "data.camera")
-    motion = read_motion(str(config["motion"]), **config["reader"])
+    motion = read_motion(str(config["motion"]), **given_options(config["reader"]))
+    tell_notes(str(config["motion"]), motion, lambda line: print(line, file=sys.stderr))
     flow = FlowConfig(**config["vision"]["flow"])
     settings = settings_of(config["data"])
     return sync_offset(str(config["video"]), motion, settings, flow, camera, dict(config["mapping"]))

@@ -12,6 +12,7 @@ from typing import Any
 
 from egopose.core.config import convert
 from egopose.core.errors import InputError
+from egopose.motion.io import given_options
 from egopose.vision.lens import Camera
 
 _MAX_FILES = 100_000
@@ -66,7 +67,7 @@ def find_sources(settings: Mapping[str, Any]) -> list[TakeSource]:
     elif kind == "takes":
         result = _listed(
             settings.get("takes"),
-            _options(settings.get("reader"), "data.reader"),
+            given_options(_options(settings.get("reader"), "data.reader")),
             _options(settings.get("camera"), "data.camera"),
         )
     else:
@@ -81,7 +82,10 @@ def _in_folder(folder: Path, settings: Mapping[str, Any]) -> list[TakeSource]:
     if not folder.is_dir():
         raise InputError(folder, "data.folder", "is not a folder")
     excluded = {str(name) for name in convert(settings.get("exclude") or [], tuple[Any, ...], "data", "data.exclude")}
-    subject, reader = _expression(settings.get("subject")), _options(settings.get("reader"), "data.reader")
+    subject, reader = (
+        _expression(settings.get("subject")),
+        given_options(_options(settings.get("reader"), "data.reader")),
+    )
     pattern = convert(settings.get("pattern"), str, "data", "data.pattern")
     try:
         paths = sorted(islice(folder.glob(pattern), _MAX_FILES))
@@ -156,7 +160,7 @@ def _listed(rows: Any, reader: dict[str, Any], camera: dict[str, Any]) -> list[T
                 name,
                 str(row.get("subject", "1")),
                 motion,
-                {**reader, **_options(row.get("reader"), f"{label}.reader")},
+                {**reader, **given_options(_options(row.get("reader"), f"{label}.reader"))},
                 Path(row["video"]).expanduser().resolve() if row.get("video") else None,
                 _sync_offset(row, label),
                 _options(row["mapping"], f"{label}.mapping") if row.get("mapping") else None,

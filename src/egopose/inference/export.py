@@ -19,8 +19,9 @@ from egopose.core.safe_io import read_json
 from egopose.data.preparation import humanoid_of
 from egopose.humanoid.inverse_dynamics import ForceSettings, with_forces
 from egopose.humanoid.model import HumanoidModel
-from egopose.motion.io import WRITERS, read_motion, write_motion, writer_suffix
+from egopose.motion.io import WRITERS, given_options, read_motion, write_motion, writer_suffix
 from egopose.motion.motion import Motion
+from egopose.motion.notes import tell_notes
 
 _SOURCE = "conf/export.yaml"
 #: Endings of what cannot be written without forces, and of what holds them besides.
@@ -57,7 +58,8 @@ def run_export(source: Path, files: Sequence[str], config: Mapping[str, Any]) ->
     held = any(suffix in _HOLD_FORCES for suffix in suffixes.values())
     written = []
     for take, path in motions.items():
-        motion = read_motion(path)
+        motion = read_motion(path, **(given_options(config["reader"]) if path == source else {}))
+        tell_notes(take, motion, lambda line: print(line, file=sys.stderr))
         if enabled is not False and (needed or held) and motion.ground_reaction is None:
             motion = _with_forces(motion, source, config, required=needed or enabled is True)
         for file, suffix in suffixes.items():

@@ -13,16 +13,29 @@ from dataclasses import dataclass
 import numpy as np
 
 from egopose.core.errors import InputError
+from egopose.motion.joint_names import plain_name, plain_names
 from egopose.motion.skeleton import Skeleton
 
 SIDES = ("right", "left")
 #: Helper bones that stand in a limb's chain in some rigs and carry no joint of their own.
-_HELPER = re.compile(r"twist|share|roll|helper|nub|(?:^|[_.:])ik[_.]", re.IGNORECASE)
+_HELPER = re.compile(r"twist|share|roll|helper|nub|(?:^|[_.:])ik[_.]|(?-i:(?<=\w)IK(?![a-z]))", re.IGNORECASE)
 _LIMB_PARTS = ("thigh", "shin", "foot", "toe", "clavicle", "arm", "forearm", "hand")
 _PARTS = ("hips", "neck", "head", *(f"{side}_{part}" for side in SIDES for part in _LIMB_PARTS))
 
 _LIMB_WORDS = (
     "foot|ankle|hand|wrist|hip|femur|tibia|toe|clavicle|humerus|radius|knee|elbow|shoulder|collar|thigh|shin|arm|leg"
+    "|palm|finger|thumb|ball|heel|calf"
+)
+
+
+#: The first that fits tells the side. A letter alone counts beside a separator, before or behind a limb's word, or as
+#: a capital of its own in a name of small and capital letters.
+_SIDE_PATTERNS = (
+    (r"(left|right)", re.IGNORECASE),
+    (r"(?:^|[_.\s()\[\]-])([lr])\d*(?:[_.\s()\[\]-]|$)", re.IGNORECASE),
+    (rf"(?:^|[_.\s-])([lr])(?:{_LIMB_WORDS})", re.IGNORECASE),
+    (rf"(?:{_LIMB_WORDS})\d*([lr])(?![a-z])", re.IGNORECASE),
+    (r"[a-z0-9]([LR])(?=$|[_.\s\d-]|[A-Z][a-z])", 0),
 )
 
 
@@ -43,16 +56,14 @@ class BodyMap:
 
 
 def side_of(name: str) -> str | None:
-    """``"left"``, ``"right"`` or None from a joint's name in any common convention (``L_Foot lfoot Foot_L``)."""
-    stripped = re.sub(r"^(cc_base_|mixamorig:?|bip\d*_?|b_|joint_|.*:)", "", name, flags=re.IGNORECASE)
-    if re.search(r"left", stripped, re.IGNORECASE):
-        return "left"
-    if re.search(r"right", stripped, re.IGNORECASE):
-        return "right"
-    if match := re.search(r"(?:^|[_.\s-])([lr])(?:[_.\s-]|$)", stripped, re.IGNORECASE):
-        return "left" if match[1].lower() == "l" else "right"
-    if match := re.match(rf"([lr])(?:{_LIMB_WORDS})", stripped, re.IGNORECASE):
-        return "left" if match[1].lower() == "l" else "right"
+    """``"left"``, ``"right"`` or None from a joint's name in any common convention.
+
+    ``LeftFoot L_Foot lfoot Foot_L foot.l.001 FootL Bob_LFoot``, and the Japanese words.
+    """
+    stripped = re.sub(r"^(cc_base_|mixamorig:?|bip\d*_?|b_|joint_|.*[:|])", "", plain_name(name), flags=re.IGNORECASE)
+    for pattern, flags in _SIDE_PATTERNS:
+        if match := re.search(pattern, stripped, flags):
+            return "left" if match[1].lower().startswith("l") else "right"
     return None
 
 
@@ -112,7 +123,7 @@ def _limb(skeleton: Skeleton, parts: dict[str, int], side: str, roles: tuple[str
         if f"{side}_{upper}" in parts:
             continue
         index = int(skeleton.parents[parts[f"{side}_{lower}"]])
-        while index > 0 and _HELPER.search(skeleton.names[index]):
+        while index > 0 and _HELPER.search(plain_names(skeleton.names)[index]):
             index = int(skeleton.parents[index])
         if index <= 0:
             raise InputError(
@@ -126,7 +137,7 @@ def _find(skeleton: Skeleton, words: tuple[str, ...], side: str | None, part: st
     for word in words:
         hits = [
             i
-            for i, name in enumerate(skeleton.names)
+            for i, name in enumerate(plain_names(skeleton.names))
             if re.search(word, name, re.IGNORECASE) and side_of(name) == side and not _HELPER.search(name)
         ]
         if hits:
@@ -140,9 +151,9 @@ def _find(skeleton: Skeleton, words: tuple[str, ...], side: str | None, part: st
 
 
 def _toe(skeleton: Skeleton, foot: int) -> int | None:
-    children = [i for i in skeleton.children(foot) if not _HELPER.search(skeleton.names[i])]
+    children = [i for i in skeleton.children(foot) if not _HELPER.search(plain_names(skeleton.names)[i])]
     children = [i for i in children if np.linalg.norm(skeleton.offsets[i]) > 0.02]
-    named = [i for i in children if re.search("toe|foot|ball", skeleton.names[i], re.IGNORECASE)]
+    named = [i for i in children if re.search("toe|foot|ball", plain_names(skeleton.names)[i], re.IGNORECASE)]
     return (named or children or [None])[0]  # type: ignore[list-item]
 
 

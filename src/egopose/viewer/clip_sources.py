@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import csv
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -21,13 +22,14 @@ from egopose.viewer.clip import Clip, Footage, Run
 _MAX_TABLE_BYTES = 64 * 2**20
 
 
-def read_run(path: str | Path, footage: Footage | None = None) -> Run:
+def read_run(path: str | Path, footage: Footage | None = None, reader: Mapping[str, Any] | None = None) -> Run:
     """All clips of a source.
 
     Args:
         path: a motion file; a folder with ``estimate.npz`` (of ``estimate``, or a take of an evaluation) or
             ``forecast.npz`` (a window); an evaluation's folder; or a run directory, whose evaluations are all shown.
         footage: the wearer's video of a source that is one clip, in place of what lies beside it.
+        reader: options for the reader of a motion file.
 
     Raises:
         InputError: nothing there that can be shown, a damaged file, or a video given for several clips.
@@ -37,7 +39,7 @@ def read_run(path: str | Path, footage: Footage | None = None) -> Run:
         raise InputError(path, "path", "no such file or folder")
     if path.is_file():
         # With a video its time 0 is the one that preparing and `egopose sync` count from.
-        motion = read_motion(path)
+        motion = read_motion(path, **(reader or {}))
         clips = {path.stem: Clip(motion if footage is None else without_lead_in(motion))}
     elif (path / "estimate.npz").is_file() or (path / "forecast.npz").is_file():
         clips = {path.name: _read_folder(path)}
@@ -55,11 +57,13 @@ def read_run(path: str | Path, footage: Footage | None = None) -> Run:
     return Run(path.name, clips)
 
 
-def read_runs(paths: Sequence[str | Path], footage: Footage | None = None) -> list[Run]:
+def read_runs(
+    paths: Sequence[str | Path], footage: Footage | None = None, reader: Mapping[str, Any] | None = None
+) -> list[Run]:
     """:func:`read_run` of each; labels are made to differ. Raises as it does."""
     runs: list[Run] = []
     for path in paths:
-        run = read_run(path, footage)
+        run = read_run(path, footage, reader)
         same = sum(other.label == run.label or other.label.startswith(f"{run.label} (") for other in runs)
         runs.append(replace(run, label=f"{run.label} ({same + 1})") if same else run)
     return runs

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import secrets
+import sys
 from collections.abc import Sequence
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from egopose.core.config import compose_config
 from egopose.core.errors import InputError
+from egopose.motion.io import given_options
+from egopose.motion.notes import tell_notes
 from egopose.vision.video import probe_video
 
 if TYPE_CHECKING:
@@ -58,4 +62,9 @@ def open_viewer(
     footage = None if video is None else Footage(video, offset or 0.0)
     if footage is not None:
         probe_video(footage.path)
-    return Viewer(read_runs(sources, footage), place, offset is None, overrides)
+    reader = compose_config("sync", ["video=-", "motion=-", *overrides])["reader"]
+    runs = read_runs(sources, footage, given_options(reader))
+    for run in runs:
+        for name, clip in run.clips.items():
+            tell_notes(name, clip.motion, lambda line: print(line, file=sys.stderr))
+    return Viewer(runs, place, offset is None, overrides)

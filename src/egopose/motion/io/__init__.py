@@ -6,7 +6,7 @@ Every reader gives a :class:`~egopose.motion.motion.Motion`: z up, metres, radia
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +29,7 @@ from egopose.motion.io.trc import write_trc
 from egopose.motion.io.trc_reader import read_trc
 from egopose.motion.motion import Motion
 
-__all__ = ["WRITERS", "read_motion", "write_motion", "writer_suffix"]
+__all__ = ["WRITERS", "given_options", "read_motion", "write_motion", "writer_suffix"]
 
 _READERS: dict[str, Callable[..., Motion]] = {
     ".bvh": read_bvh,
@@ -59,9 +59,10 @@ def read_motion(path: str | Path, **options: Any) -> Motion:
     """Read a motion file; the suffix says how, and for ``.npz`` the arrays inside.
 
     Args:
-        path: ``.bvh`` (options ``unit``, ``up``), ``.amc`` (``asf``, ``fps``), ``.txt`` (DeepMimic), ``.mvnx``
-            (Xsens; ``subject``), ``.trc`` and ``.c3d`` (points; ``unit``, ``up``, ``fps``, ``points``), ``.npz`` (the
-            project's own clip, or AMASS with the option ``joints``).
+        path: ``.bvh`` (options ``unit``, ``up``, ``fps``, ``encoding``), ``.amc`` (these and ``asf``), ``.txt``
+            (DeepMimic: ``up``, ``fps``, ``encoding``), ``.mvnx`` (Xsens; ``subject``), ``.trc`` and ``.c3d`` (points;
+            ``unit``, ``up``, ``fps``, ``points``), ``.npz`` (the project's own clip, or AMASS and SMPL with
+            ``joints``, ``up``, ``fps``).
         options: of that reader.
 
     Raises:
@@ -76,6 +77,11 @@ def read_motion(path: str | Path, **options: Any) -> Motion:
     if reader is None:
         raise InputError(path, "suffix", f"no reader for {suffix!r}; there is one for {', '.join([*_READERS, '.npz'])}")
     return _call(reader, path, options, path)
+
+
+def given_options(reader: Mapping[str, Any]) -> dict[str, Any]:
+    """Of a resolved ``conf/reader`` group what was given: options for :func:`read_motion`."""
+    return {name: value for name, value in reader.items() if value is not None}
 
 
 def write_motion(motion: Motion, path: str | Path, **options: Any) -> None:
@@ -107,9 +113,9 @@ def writer_suffix(path: Path) -> str:
 
 
 def _call(function: Callable[..., Any], path: Path, options: dict[str, Any], *arguments: Any) -> Any:
-    known = set(function.__kwdefaults__ or ())
-    unknown = sorted(set(options) - known)
+    known = list(function.__kwdefaults__ or ())
+    unknown = sorted(set(options) - set(known))
     if unknown:
-        has = f"has the options {', '.join(sorted(known))}" if known else "has no options"
+        has = f"has the options {', '.join(known)}" if known else "has no options"
         raise InputError(path, f"option {unknown[0]}", f"{function.__name__} {has}")
     return function(*arguments, **options)

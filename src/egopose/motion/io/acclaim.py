@@ -15,13 +15,24 @@ from egopose.core.errors import InputError
 from egopose.motion import rotations as rot
 from egopose.motion.io._files import excerpt
 from egopose.motion.io.acclaim_syntax import AsfFile, parse_amc, parse_asf
-from egopose.motion.io.frames import continuous_euler, up_rotation
+from egopose.motion.io.body_size import stature
+from egopose.motion.io.body_unit import STATURE_RANGE, guess_unit
+from egopose.motion.io.frames import continuous_euler, given_rate, given_unit, given_up, up_rotation
+from egopose.motion.kinematics import forward_kinematics
 from egopose.motion.motion import Motion
 from egopose.motion.rotations import Array
 from egopose.motion.skeleton import Dof, Joint, Skeleton
 
 
-def read_amc(path: str | Path, *, asf: str | Path | None = None, fps: float = 120.0) -> Motion:
+def read_amc(
+    path: str | Path,
+    *,
+    asf: str | Path | None = None,
+    fps: float = 120.0,
+    unit: str | float = "auto",
+    up: str = "auto",
+    encoding: str = "auto",
+) -> Motion:
     """Read an AMC file and the ASF skeleton it belongs to.
 
     Args:
@@ -29,6 +40,9 @@ def read_amc(path: str | Path, *, asf: str | Path | None = None, fps: float = 12
         asf: the skeleton; by default the ``.asf`` beside it called like the file or like the part of its name before
             the first ``_`` (``05_06.amc``: ``05.asf``), or the only ``.asf`` there.
         fps: the format does not say; CMU recorded at 120.
+        unit: of lengths, see :func:`egopose.motion.io.bvh.read_bvh`; ``"auto"``: what the skeleton says.
+        up: the files' up axis; ``"auto"``: y, as the format has it.
+        encoding: of both texts, see :func:`egopose.motion.io._files.read_text`.
 
     Returns:
         z up, metres. Names of joints are the bones'; ``root`` comes first.
@@ -37,16 +51,21 @@ def read_amc(path: str | Path, *, asf: str | Path | None = None, fps: float = 12
         InputError: names the file, line and cause.
     """
     path = Path(path)
-    if not (np.isfinite(fps) and 0 < fps <= 1e5):
-        raise InputError(path, "option fps", f"{fps} is not a frame rate")
+    rate, given = given_rate(path, fps), given_unit(path, unit)
+    up = "y" if given_up(path, up) == "auto" else up
     asf_path = _find_asf(path) if asf is None else Path(asf)
-    skeleton_file = parse_asf(asf_path)
-    frames, columns, degrees = parse_amc(path, skeleton_file)
+    skeleton_file = parse_asf(asf_path, encoding)
+    frames, columns, degrees = parse_amc(path, skeleton_file, encoding)
     skeleton, dof_columns = _skeleton(asf_path, skeleton_file, columns)
+    notes: list[str] = []
+    given = given or _other_unit(skeleton_file, skeleton, notes)
+    if given is not None:
+        skeleton_file = skeleton_file.in_unit(given[1])
+        skeleton, dof_columns = _skeleton(asf_path, skeleton_file, columns)
 
     scale = np.pi / 180.0 if degrees else 1.0
     root = frames[:, : len(skeleton_file.root_order)]
-    position, quat = _root_pose(skeleton_file, root, scale)
+    position, quat = _root_pose(skeleton_file, root, scale, up_rotation(up))
     factors = np.array([skeleton_file.metres if is_length else scale for _, is_length in dof_columns])
     values = frames[:, [column for column, _ in dof_columns]] * factors
     for joint, columns_of_joint in zip(skeleton.joints, skeleton.dof_slices, strict=True):
@@ -57,11 +76,28 @@ def read_amc(path: str | Path, *, asf: str | Path | None = None, fps: float = 12
         "format": "amc",
         "source": path.name,
         "skeleton": asf_path.name,
-        "unit": "asf",
+        "unit": "asf" if given is None else given[0],
         "unit_metres": skeleton_file.metres,
-        "up": "y",
+        "up": up,
+        "notes": notes,
     }
-    return Motion(skeleton, qpos, float(fps), name=path.stem, meta=meta)
+    return Motion(skeleton, qpos, rate, name=path.stem, meta=meta)
+
+
+def _other_unit(asf: AsfFile, skeleton: Skeleton, notes: list[str]) -> tuple[str, float] | None:
+    """The likeliest unit where the one that the skeleton states makes it no person's; else None."""
+    height = stature(skeleton, forward_kinematics(skeleton, skeleton.rest_qpos()[None])[0])
+    low, high = STATURE_RANGE
+    if low <= height <= high:
+        return None
+    guess = guess_unit(height / asf.metres, np.zeros((1, 3)), 1.0)
+    if guess is None:
+        return None
+    notes.append(
+        f"the skeleton states a unit that makes it {height:.2f} m tall; {guess.name} is taken: "
+        f"{height / asf.metres * guess.metres:.2f} m; reader.unit says otherwise"
+    )
+    return guess.name, guess.metres
 
 
 def _find_asf(path: Path) -> Path:
@@ -78,7 +114,7 @@ def _find_asf(path: Path) -> Path:
     raise InputError(path, "option asf", f"no skeleton {path.stem.split('_')[0]}.asf beside it ({result}); name one")
 
 
-def _root_pose(asf: AsfFile, values: Array, scale: float) -> tuple[Array, Array]:
+def _root_pose(asf: AsfFile, values: Array, scale: float, to_z_up: Array) -> tuple[Array, Array]:
     position = np.tile(asf.root_position, (len(values), 1))
     quat = np.tile([1.0, 0.0, 0.0, 0.0], (len(values), 1))
     frame = rot.from_scipy(asf.root_frame, ())
@@ -89,7 +125,6 @@ def _root_pose(asf: AsfFile, values: Array, scale: float) -> tuple[Array, Array]
         else:  # the first angle listed turns last, about axes that stay
             quat = rot.multiply(rot.from_axis_angle(np.eye(3)[axis], values[:, k] * scale), quat)
     quat = rot.multiply(rot.multiply(frame, quat), rot.conjugate(frame))
-    to_z_up = up_rotation("y")
     return rot.rotate(to_z_up, position), rot.multiply(to_z_up, quat)
 
 

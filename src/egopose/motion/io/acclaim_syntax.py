@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from egopose.core.errors import InputError
-from egopose.motion.io._files import MAX_JOINTS, check_values, excerpt, read_text
+from egopose.motion.io._files import MAX_JOINTS, check_values, excerpt, numbers_apart, read_text
 from egopose.motion.rotations import Array
 
 _MAX_VALUE = 1e7
@@ -42,11 +42,15 @@ class AsfFile:
     root_frame: Rotation
     root_position: Array
 
+    def in_unit(self, metres: float) -> AsfFile:
+        """The skeleton with another unit than it says."""
+        return replace(self, metres=metres, root_position=self.root_position * (metres / self.metres))
 
-def parse_asf(path: Path) -> AsfFile:
+
+def parse_asf(path: Path, encoding: str = "auto") -> AsfFile:
     sections: dict[str, list[tuple[int, list[str]]]] = {}
     current = ""
-    for number, line in enumerate(read_text(path).split("\n"), 1):
+    for number, line in enumerate(read_text(path, encoding=encoding).split("\n"), 1):
         if len(line) > 4096:
             raise InputError(path, f"line {number}", f"{len(line)} characters long: not a line of a skeleton")
         words = line.split("#")[0].replace("(", " ").replace(")", " ").split()
@@ -178,8 +182,11 @@ def _parse_hierarchy(path: Path, lines: list[tuple[int, list[str]]], bones: dict
     return parents
 
 
-def parse_amc(path: Path, asf: AsfFile) -> tuple[Array, dict[str, int], bool]:
-    """Frames ``[T, C]`` (root first, then bones with degrees of freedom), each bone's first column, degrees or not."""
+def parse_amc(path: Path, asf: AsfFile, encoding: str = "auto") -> tuple[Array, dict[str, int], bool]:
+    """Frames ``[T, C]`` (root first, then bones with degrees of freedom), each bone's first column, degrees or not.
+
+    Frames are numbered from any number on: a piece of a longer recording keeps its own.
+    """
     moving = [asf.bones[name] for name in asf.parents if asf.bones[name].dofs]
     columns, width = {"root": 0}, len(asf.root_order)
     counts = {"root": width}
@@ -187,14 +194,14 @@ def parse_amc(path: Path, asf: AsfFile) -> tuple[Array, dict[str, int], bool]:
         columns[bone.name], counts[bone.name] = width, len(bone.dofs)
         width += len(bone.dofs)
     rows: list[Array] = []
-    degrees, row, seen, number = asf.degrees, np.empty(0), set(counts), 0
+    degrees, row, seen, number, first = asf.degrees, np.empty(0), set(counts), 0, 1
 
     def finish() -> None:
         if seen != set(counts):
             missing = sorted(set(counts) - seen)[0]
             raise InputError(path, f"line {number}", f"frame {len(rows)} lacks bone {excerpt(missing)}: cut short")
 
-    for number, line in enumerate(read_text(path).split("\n"), 1):
+    for number, line in enumerate(read_text(path, encoding=encoding).split("\n"), 1):
         if len(line) > 4096:
             raise InputError(path, f"line {number}", f"{len(line)} characters long: not a line of motion")
         words = line.split("#")[0].split()
@@ -204,8 +211,11 @@ def parse_amc(path: Path, asf: AsfFile) -> tuple[Array, dict[str, int], bool]:
             degrees = {":degrees": True, ":radians": False}.get(words[0].lower(), degrees)
         elif len(words) == 1 and words[0].isdigit():
             finish()
-            if len(words[0]) > 9 or int(words[0]) != len(rows) + 1:
-                raise InputError(path, f"line {number}", f"frame {excerpt(words[0])} where {len(rows) + 1} should be")
+            if not rows and len(words[0]) <= 9:
+                first = int(words[0])
+            expected = first + len(rows)
+            if len(words[0]) > 9 or int(words[0]) != expected:
+                raise InputError(path, f"line {number}", f"frame {excerpt(words[0])} where {expected} should be")
             check_values(path, f"line {number}", len(rows) + 1, width + 12)
             row, seen = np.zeros(width), set()
             rows.append(row)
@@ -225,6 +235,8 @@ def parse_amc(path: Path, asf: AsfFile) -> tuple[Array, dict[str, int], bool]:
 
 
 def _floats(path: Path, number: int, words: list[str], count: int) -> Array:
+    if len(words) < count:
+        words = numbers_apart(" ".join(words), count)
     try:
         values = np.array([float(w) for w in words])
     except ValueError:

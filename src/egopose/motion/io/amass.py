@@ -1,4 +1,4 @@
-"""AMASS-style ``.npz``: root translation and axis-angle poses of an SMPL, SMPL-H or SMPL-X body, z up, metres.
+"""AMASS-style ``.npz``: root translation and axis-angle poses of an SMPL, SMPL-H or SMPL-X body, metres.
 
 The 22 joints all three share are read; fingers, jaw and eyes are left out and counted in ``meta``. The files hold no
 bone lengths (the body models that do are under licence), so a plain adult's of round figures are used unless given.
@@ -13,9 +13,10 @@ from numpy.typing import ArrayLike
 
 from egopose.core.errors import InputError
 from egopose.motion import rotations as rot
-from egopose.motion.io._files import excerpt
-from egopose.motion.io._npz import read_arrays
-from egopose.motion.io.frames import euler_angles
+from egopose.motion.io.frames import euler_angles, given_rate, given_up, up_rotation
+from egopose.motion.io.smpl_arrays import read_smpl_arrays
+from egopose.motion.io.smpl_up import guess_up
+from egopose.motion.kinematics import forward_kinematics
 from egopose.motion.motion import Motion
 from egopose.motion.rotations import Array
 from egopose.motion.skeleton import Joint, Skeleton, hinges
@@ -59,66 +60,70 @@ _TIPS = {
     "left_wrist": ((0.18, 0.0, 0.0),),
     "right_wrist": ((-0.18, 0.0, 0.0),),
 }
-_WIDTHS = {66: "body", 72: "SMPL", 156: "SMPL-H", 165: "SMPL-X"}
-_RATES = ("mocap_framerate", "mocap_frame_rate", "fps")
+#: m; no recording begins this near to the origin in all three directions.
+_MOVED = 0.02
 
 
-def read_amass(path: str | Path, *, joints: ArrayLike | None = None) -> Motion:
-    """Read an AMASS-style file: ``poses [T, 66 | 72 | 156 | 165]`` (rad), ``trans [T, 3]`` (m), ``mocap_framerate``.
+def read_amass(
+    path: str | Path,
+    *,
+    joints: ArrayLike | None = None,
+    up: str = "auto",
+    fps: float | None = None,
+) -> Motion:
+    """Read an AMASS-style file, or one of a tool that writes SMPL's parameters under other names.
+
+    ``poses [T, 66 | 72 | 156 | 165]`` (rad; also ``[T, J, 3]``), ``trans [T, 3]`` (m), ``mocap_framerate``; other names
+    see :mod:`egopose.motion.io.smpl_arrays`.
 
     Args:
         path: the file.
         joints: ``[22, 3]`` positions of the body's joints in its T-pose (m, y up, as SMPL's regressor gives them for
             the subject's shape); by default a plain adult's.
+        up: the file's up axis; ``"auto"``: AMASS's z, unless the body stands along another.
+        fps: frames per second, in place of what the file says.
 
     Raises:
-        InputError: an array missing, of another shape, not finite, or of absurd size.
+        InputError: an array missing, of another shape, not finite, or of absurd size; a frame rate neither in the file
+            nor given.
     """
     path = Path(path)
-    arrays = read_arrays(path, ("poses", "trans", *_RATES))
-    for name in ("poses", "trans"):
-        if name not in arrays:
-            raise InputError(path, name, "missing: an AMASS file holds poses, trans and mocap_framerate")
-        array = arrays[name]
-        if array.ndim != 2 or array.dtype.kind != "f" or not len(array):
-            raise InputError(path, name, f"must be [T, n] floats, got {array.dtype} {array.shape}")
-        bad = ~(np.abs(array) < 1e4).all(axis=1)
-        if bad.any():
-            raise InputError(path, name, f"frame {int(np.argmax(bad))} is not finite or absurdly large")
-    poses, trans = arrays["poses"].astype(np.float64), arrays["trans"].astype(np.float64)
-    if poses.shape[1] not in _WIDTHS:
-        raise InputError(path, "poses", f"{poses.shape[1]} columns; known are {', '.join(map(str, _WIDTHS))}")
-    if trans.shape != (len(poses), 3):
-        raise InputError(path, "trans", f"shape {trans.shape}, poses have {len(poses)} frames")
+    given_up(path, up)
+    given = None if fps is None else given_rate(path, fps)
+    arrays = read_smpl_arrays(path)
+    rate = given if given is not None else arrays.fps
+    if rate is None:
+        raise InputError(path, "mocap_framerate", "missing: the frame rate is not said; give the option fps")
     rest = rest_positions() if joints is None else np.asarray(joints, dtype=np.float64)
     if rest.shape != (len(_BODY), 3) or not np.isfinite(rest).all():
         raise InputError(path, "option joints", f"must be [{len(_BODY)}, 3] finite positions, got {rest.shape}")
     skeleton = _skeleton(rest)
-    quats = rot.from_rotvec(poses[:, :66].reshape(len(poses), len(_BODY), 3))
-    columns = [trans + rest[0], rot.continuous(quats[:, 0])]
+    quats = rot.from_rotvec(arrays.turns)
+    columns = [arrays.place + rest[0], rot.continuous(quats[:, 0])]
     columns += [euler_angles(quats[:, i], _BODY[i][3]) for i in range(1, len(_BODY))]
+    qpos = np.concatenate(columns, axis=1)
+    notes = []
+    if up == "auto":
+        ankles = (skeleton.index("left_ankle"), skeleton.index("right_ankle"))
+        moved = bool(np.abs(arrays.place[0]).max() < _MOVED)
+        usual = forward_kinematics(_skeleton(rest_positions()), qpos)[0]  # given joints may be of anything
+        up = guess_up(usual, skeleton.index("head"), ankles, moved)
+        if up != "z":
+            notes.append(f"{up} is taken for up: the body stands along it; reader.up says otherwise")
+    to_z_up = up_rotation(up)
+    qpos[:, :3], qpos[:, 3:7] = rot.rotate(to_z_up, qpos[:, :3]), rot.multiply(to_z_up, qpos[:, 3:7])
     meta = {
         "format": "amass",
         "source": path.name,
         "unit": "m",
         "unit_metres": 1.0,
-        "up": "z",
-        "body_model": _WIDTHS[poses.shape[1]],
-        "dropped_columns": poses.shape[1] - 66,
+        "up": up,
+        "body_model": arrays.model,
+        "dropped_columns": arrays.dropped,
         "bone_lengths": "plain adult" if joints is None else "given",
+        "notes": notes,
     }
-    return Motion(skeleton, np.concatenate(columns, axis=1), _rate(path, arrays), name=path.stem, meta=meta)
-
-
-def _rate(path: Path, arrays: dict[str, np.ndarray]) -> float:
-    for name in _RATES:
-        if name in arrays:
-            value = arrays[name]
-            if value.size != 1 or value.dtype.kind not in "fiu" or not 0.1 <= float(value.reshape(())) <= 1e5:
-                shown = str(value.tolist()) if value.size == 1 else f"an array of shape {value.shape}"
-                raise InputError(path, name, f"{excerpt(shown)} is not a frame rate")
-            return float(value.reshape(()))
-    raise InputError(path, _RATES[0], "missing: the frame rate is not said")
+    return Motion(skeleton, qpos, rate, name=path.stem, meta=meta)
 
 
 def rest_positions() -> Array:

@@ -10,15 +10,13 @@ import re
 
 import numpy as np
 
-from egopose.motion.io.frames import UNITS
+from egopose.motion.joint_names import plain_names
 from egopose.motion.kinematics import forward_kinematics
 from egopose.motion.rotations import Array
 from egopose.motion.skeleton import Skeleton
 
 #: Stature is about this much of the bones from ankle to head joint; soles and the crown are missing from them.
 _STATURE_PER_PATH = 1.08
-_TYPICAL_STATURE = 1.7
-STATURE_RANGE = (0.9, 2.4)
 
 
 def stature(skeleton: Skeleton, positions: Array) -> float:
@@ -40,13 +38,6 @@ def stature(skeleton: Skeleton, positions: Array) -> float:
     leaves = sorted(set(range(len(skeleton))) - set(skeleton.parents.tolist()))
     far = max(leaves, key=lambda leaf: _path(skeleton, lengths, 0, leaf))
     return max(_path(skeleton, lengths, far, leaf) for leaf in leaves) / 1.35
-
-
-def guess_unit(height: float) -> str | None:
-    """The unit that makes a stature of ``height`` units nearest to 1.7 m; None when none makes it a person's."""
-    best = min(UNITS, key=lambda unit: abs(np.log(max(height, 1e-12) * UNITS[unit] / _TYPICAL_STATURE)))
-    low, high = STATURE_RANGE
-    return best if low <= height * UNITS[best] <= high else None
 
 
 def guess_up(skeleton: Skeleton, qpos: Array) -> str:
@@ -71,12 +62,12 @@ _PATTERNS = {"head": ("head", "neck"), "foot": ("foot|ankle", "toe", "leg|shin|c
 def named(skeleton: Skeleton, part: str) -> list[int]:
     """Joints whose names speak of the ``"head"`` or a ``"foot"``: the first in the tree of each branch."""
     for pattern in _PATTERNS[part]:
-        result: list[int] = []
-        for i, name in enumerate(skeleton.names):
-            if re.search(pattern, name.lower()) and not set(_ancestors(skeleton, i)) & set(result):
-                result.append(i)
-        if result:
-            return result
+        found: list[int] = []
+        for i, name in enumerate(plain_names(skeleton.names)):
+            if re.search(pattern, name.lower()) and not set(_ancestors(skeleton, i)) & set(found):
+                found.append(i)
+        if found:
+            return found
     return []
 
 

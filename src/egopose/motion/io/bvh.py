@@ -1,12 +1,14 @@
 """BVH: any skeleton, any channel order, 3 or 6 channels a joint, any up axis and unit.
 
 A joint's rotation channels become hinges in the file's order; of equal triples of angles the continuous ones are taken.
-Position channels replace the joint's OFFSET, as exporters mean them; where they stay constant they become the offset,
-else slides before the hinges.
+Position channels replace the joint's OFFSET, as most exporters mean them, or are added to it, as the values say; where
+they stay constant they become the offset, else slides before the hinges.
 """
 
 from __future__ import annotations
 
+import itertools
+from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,9 +16,17 @@ import numpy as np
 
 from egopose.core.errors import InputError
 from egopose.motion import rotations as rot
-from egopose.motion.io.body_size import STATURE_RANGE, guess_unit, guess_up, stature
+from egopose.motion.io.body_size import guess_up, named, stature
+from egopose.motion.io.body_unit import STATURE_RANGE, guess_unit
 from egopose.motion.io.bvh_syntax import BvhFile, BvhJoint, parse_bvh
-from egopose.motion.io.frames import UNITS, UP_AXES, continuous_euler, frame_rate, up_rotation
+from egopose.motion.io.frames import (
+    continuous_euler,
+    frame_rate,
+    given_rate,
+    given_unit,
+    given_up,
+    up_rotation,
+)
 from egopose.motion.kinematics import forward_kinematics
 from egopose.motion.motion import Motion
 from egopose.motion.rotations import Array
@@ -26,34 +36,59 @@ from egopose.motion.skeleton import Joint, Skeleton, hinges, slides
 _STILL = 5e-5
 _GUESS_FRAMES = 60
 
+#: Share of the misfit that is left where positions are added to OFFSET; bones that stretch leave a twentieth.
+_CLEARLY = 0.2
 
-def read_bvh(path: str | Path, *, unit: str | float = "auto", up: str = "auto") -> Motion:
+#: m; what a unit that was asked for may make of a body: puppets and giants too, but not what is a wrong unit.
+_ANY_STATURE = (0.1, 20.0)
+
+
+def read_bvh(
+    path: str | Path,
+    *,
+    unit: str | float = "auto",
+    up: str = "auto",
+    fps: float | None = None,
+    encoding: str = "auto",
+) -> Motion:
     """Read a BVH file.
 
     Args:
         path: the file.
-        unit: of its lengths: ``"auto"`` (the one that makes the body nearest to 1.7 m), ``"m"``, ``"cm"``, ``"mm"``,
-            ``"inch"``, ``"asf"`` (CMU's own, 0.0564 m), or metres a unit as a number.
+        unit: of its lengths: ``"auto"`` (the likeliest, see :mod:`egopose.motion.io.body_unit`), ``"m"``, ``"dm"``,
+            ``"cm"``, ``"mm"``, ``"inch"``, ``"asf"`` (CMU's own, 0.0564 m), or metres a unit as a number.
         up: ``"auto"`` (head above feet, on average), or ``"x"``, ``"-x"``, ``"y"``, ``"-y"``, ``"z"``, ``"-z"``.
+        fps: frames per second, in place of the file's frame time.
+        encoding: of the text, see :func:`egopose.motion.io._files.read_text`.
 
     Returns:
-        z up, metres. The up axis turns the root only. ``meta`` records format, source, unit, up axis, stature and the
-        names of roots above the body that were folded into its first joint (``folded_roots``).
+        z up, metres. The up axis turns the root only. ``meta`` records format, source, unit, up axis, stature, the
+        names of roots above the body that were folded into its first joint (``folded_roots``), and in ``notes`` what
+        was read otherwise than it is written.
 
     Raises:
-        InputError: names the file, line and cause; also when no unit makes the body a person's size.
+        InputError: names the file, line and cause; also when the unit makes the body no person's size.
     """
     path = Path(path)
-    if up != "auto" and up not in UP_AXES:
-        raise InputError(path, "option up", f"{up!r} is none of auto, {', '.join(UP_AXES)}")
-    raw = parse_bvh(path)
-    poses = _local_poses(raw)
+    given_up(path, up)
+    given = given_unit(path, unit)
+    raw = parse_bvh(path, encoding, timed=fps is None)
+    notes = list(raw.notes)
+    rate = frame_rate(raw.frame_time) if fps is None else given_rate(path, fps)
+    if fps is None and abs(rate * float(raw.frame_time) - 1.0) > 5e-4:
+        notes.append(f"the frame time {raw.frame_time} s is taken for {rate:g} frames/s; reader.fps says otherwise")
+    poses = _local_poses(raw, notes)
     folded = _fold_carriers(raw.joints, poses)
 
     sample = np.unique(np.linspace(0, len(raw.values) - 1, _GUESS_FRAMES).astype(int))
     skeleton, qpos = _assemble(raw.joints, [p.at(sample) for p in poses], folded, 1.0, up_rotation("z"), still=-1.0)
     height = stature(skeleton, forward_kinematics(skeleton, qpos)[0])
-    unit_name, metres = _unit(path, unit, height)
+    travel = np.sum([p.translation for p in poses[: folded + 1]], axis=0)
+    unit_name, metres = given or _guessed_unit(path, height, travel, rate, notes)
+    low, high = _ANY_STATURE
+    if not low <= height * metres <= high and named(skeleton, "head") and named(skeleton, "foot"):
+        cause = f"makes the body {height * metres:.3g} m tall ({height:.4g} units); {low} to {high} m are read"
+        raise InputError(path, "option unit", cause)
     up = guess_up(skeleton, qpos) if up == "auto" else up
 
     skeleton, qpos = _assemble(raw.joints, poses, folded, metres, up_rotation(up), still=_STILL)
@@ -65,8 +100,9 @@ def read_bvh(path: str | Path, *, unit: str | float = "auto", up: str = "auto") 
         "up": up,
         "stature": round(height * metres, 4),
         "folded_roots": [j.name for j in raw.joints[:folded]],
+        "notes": notes,
     }
-    return Motion(skeleton, qpos, frame_rate(raw.frame_time), name=path.stem, meta=meta)
+    return Motion(skeleton, qpos, rate, name=path.stem, meta=meta)
 
 
 @dataclass(frozen=True)
@@ -89,22 +125,56 @@ class _LocalPose:
         return out
 
 
-def _local_poses(raw: BvhFile) -> list[_LocalPose]:
-    poses, column = [], 0
-    for joint in raw.joints:
+def _local_poses(raw: BvhFile, notes: list[str]) -> list[_LocalPose]:
+    poses, columns, added = [], _columns(raw.joints), _added_to_offset(raw)
+    if any(added):
+        notes.append("positions of joints below the root are added to OFFSET, as their values say")
+    for joint, column, adds in zip(raw.joints, columns, added, strict=True):
         channels = joint.channels or ()
         values = raw.values[:, column : column + len(channels)]
-        column += len(channels)
-        translation = np.tile(np.array(joint.offset), (len(values), 1))
+        offset = np.array(joint.offset)
+        translation = np.tile(offset, (len(values), 1))
         turning = [k for k, c in enumerate(channels) if c.endswith("rotation")]
         for k, channel in enumerate(channels):
             if channel.endswith("position"):
-                translation[:, "xyz".index(channel[0])] = values[:, k]
+                axis = "xyz".index(channel[0])
+                translation[:, axis] = values[:, k] + (offset[axis] if adds else 0.0)
         axes = "".join(channels[k][0] for k in turning)
         angles = np.deg2rad(values[:, turning])
         angles = continuous_euler(angles) if len(set(axes)) == 3 else np.unwrap(angles, axis=0)
         poses.append(_LocalPose(translation, len(turning) < len(channels), axes, angles))
     return poses
+
+
+def _columns(joints: list[BvhJoint]) -> list[int]:
+    """The first column of each joint's channels."""
+    return [0, *itertools.accumulate(len(joint.channels or ()) for joint in joints)][:-1]
+
+
+def _added_to_offset(raw: BvhFile) -> list[bool]:
+    """For each joint, whether its position channels say what is added to OFFSET, rather than what replaces it.
+
+    Bones hardly change their length: over all joints the values stay near the OFFSETs where they replace them, and near
+    nothing where they are added. What is neither is taken for the usual, which is to replace. The body's first joint
+    and those above it have their place in the world: they do not vote, and where the others' are added each is taken
+    for what fits its own values.
+    """
+    misfits = np.zeros((len(raw.joints), 2))  # were they added; did they replace
+    for i, (joint, column) in enumerate(zip(raw.joints, _columns(raw.joints), strict=True)):
+        for k, channel in enumerate(joint.channels or ()):
+            if channel.endswith("position"):
+                values, offset = raw.values[:, column + k], np.array(joint.offset)["xyz".index(channel[0])]
+                misfits[i] += np.percentile(np.abs(values), 90), np.percentile(np.abs(values - offset), 90)
+    body = _first_branching(raw.joints)
+    added, replaced = misfits[body + 1 :].sum(axis=0)
+    own = misfits[:, 0] < misfits[:, 1]
+    return [bool(added < _CLEARLY * replaced and (i > body or own[i])) for i in range(len(raw.joints))]
+
+
+def _first_branching(joints: list[BvhJoint]) -> int:
+    """The first joint that carries another number of joints than one."""
+    carried = Counter(joint.parent for joint in joints)
+    return next(i for i in range(len(joints)) if carried[i] != 1)
 
 
 def _fold_carriers(joints: list[BvhJoint], poses: list[_LocalPose]) -> int:
@@ -169,15 +239,9 @@ def _triple(vector: Array) -> tuple[float, float, float]:
     return float(vector[0]), float(vector[1]), float(vector[2])
 
 
-def _unit(path: Path, unit: str | float, height: float) -> tuple[str, float]:
-    """Name and metres of the unit asked for, or guessed from the body's ``height`` in units."""
-    if isinstance(unit, str) and unit in UNITS:
-        return unit, UNITS[unit]
-    if isinstance(unit, int | float) and np.isfinite(unit) and unit > 0:
-        return f"{float(unit):g} m", float(unit)
-    if unit != "auto":
-        raise InputError(path, "option unit", f"{unit!r} is none of auto, {', '.join(UNITS)} or metres a unit")
-    guess = guess_unit(height)
+def _guessed_unit(path: Path, height: float, root: Array, fps: float, notes: list[str]) -> tuple[str, float]:
+    """Name and metres of the unit that the body's ``height`` in units and its ways speak for."""
+    guess = guess_unit(height, root, fps)
     if guess is None:
         low, high = STATURE_RANGE
         cause = (
@@ -185,4 +249,6 @@ def _unit(path: Path, unit: str | float, height: float) -> tuple[str, float]:
             "give the option unit (m, cm, mm, inch, asf or metres a unit)"
         )
         raise InputError(path, "OFFSET", cause)
-    return guess, UNITS[guess]
+    if guess.doubt:
+        notes.append(guess.doubt)
+    return guess.name, guess.metres

@@ -15,10 +15,14 @@ from pathlib import Path
 import numpy as np
 
 from egopose.core.errors import InputError
-from egopose.motion.io._files import MAX_JOINTS, check_values, excerpt, read_text
+from egopose.motion.io._files import MAX_JOINTS, check_values, excerpt, numbers_apart, read_text
 from egopose.motion.rotations import Array
 
-_MOTION = re.compile(r"^[ \t]*MOTION[ \t]*$", re.MULTILINE)
+_MOTION = re.compile(r"^[ \t]*MOTION[ \t]*$", re.MULTILINE | re.IGNORECASE)
+_EXPECTED = "expected JOINT, End Site, OFFSET, CHANNELS, '{' or '}'"
+_END = ("END", "ENDSITE", "END_SITE", "END-SITE")
+_COMMENT = ("#", "//", ";")
+_FIELD = re.compile(r"(frames|frame[ \t_]*time)[ \t]*(:|[ \t])[ \t]*(.*)", re.IGNORECASE)
 _CHANNELS = {f"{axis}{kind}" for axis in "xyz" for kind in ("position", "rotation")}
 
 #: Coordinates beyond this (in any unit) are no person's.
@@ -30,6 +34,9 @@ _MAX_HIERARCHY_LINE = 16 * 1024
 
 #: End Sites in sum.
 _MAX_TIPS = 4 * MAX_JOINTS
+
+#: Frames from which on one more or fewer than announced is a writer's slip.
+_LEAST_FOR_A_SLIP = 10
 
 #: Characters a written number may take: the longest double is 24.
 _MAX_NUMBER_CHARACTERS = 64
@@ -49,26 +56,36 @@ class BvhJoint:
 
 @dataclass(frozen=True)
 class BvhFile:
-    """``joints``, seconds a frame, and ``values [T, C]`` for all channels in order (degrees for rotations)."""
+    """``joints``, seconds a frame as written, and ``values [T, C]`` for all channels in order (degrees for rotations).
+
+    ``notes``: sentences on what was read otherwise than it is written.
+    """
 
     joints: list[BvhJoint]
-    frame_time: float
+    frame_time: str
     values: Array
+    notes: list[str]
 
 
-def parse_bvh(path: Path) -> BvhFile:
+def parse_bvh(path: Path, encoding: str = "auto", timed: bool = True) -> BvhFile:
     """Read a BVH file.
+
+    Args:
+        path: the file.
+        encoding: see :func:`read_text`.
+        timed: whether its frame time must be a time; not where the rate is known from elsewhere.
 
     Raises:
         InputError: names the file, the line and what is wrong there.
     """
-    text = read_text(path)
+    text = read_text(path, encoding=encoding)
     motion = _MOTION.search(text)
     if motion is None:
         raise InputError(path, f"line {text.count(chr(10)) + 1}", "no MOTION section: not a BVH file, or cut short")
     joints = _parse_hierarchy(path, text, motion.start())
-    frame_time, values = _parse_motion(path, text, motion.end(), joints)
-    return BvhFile(joints, frame_time, values)
+    notes: list[str] = []
+    frame_time, values = _parse_motion(path, text, motion.end(), joints, timed, notes)
+    return BvhFile(joints, frame_time, values, notes)
 
 
 def _parse_hierarchy(path: Path, text: str, end: int) -> list[BvhJoint]:
@@ -89,6 +106,8 @@ def _parse_hierarchy(path: Path, text: str, end: int) -> list[BvhJoint]:
             raise InputError(path, where, f"{stop - start} characters long: not a line of a BVH hierarchy")
         tokens = text[start:stop].replace("{", " { ").replace("}", " } ").split()
         start = stop + 1
+        if tokens and tokens[0].startswith(_COMMENT):
+            continue
         while tokens:
             word = tokens.pop(0)
             key = word.upper()
@@ -126,13 +145,16 @@ def _parse_hierarchy(path: Path, text: str, end: int) -> list[BvhJoint]:
                 names[name] = number
                 joints.append(BvhJoint(name, stack[-1] if stack else -1, number))
                 pending = len(joints) - 1
-            elif key == "END":
+            elif key in _END:
                 if not stack or stack[-1] < 0:
                     raise InputError(path, where, "End Site outside a joint")
                 cut = tokens.index("{") if "{" in tokens else len(tokens)
                 tokens = tokens[cut:]
                 pending = -1
             elif key == "OFFSET":
+                cut = tokens.index("}") if "}" in tokens else len(tokens)
+                if cut < 3:  # minus signs may stand for blanks
+                    tokens = [*numbers_apart(" ".join(tokens[:cut]), 3), *tokens[cut:]]
                 offset, tokens = _numbers(path, where, "OFFSET", tokens, 3), tokens[3:]
                 if not stack:
                     raise InputError(path, where, "OFFSET outside a joint")
@@ -163,7 +185,7 @@ def _parse_hierarchy(path: Path, text: str, end: int) -> list[BvhJoint]:
                     raise InputError(path, where, "a channel stands twice")
                 joints[stack[-1]].channels = channels
             else:
-                raise InputError(path, where, f"unknown word {excerpt(word)} in the hierarchy")
+                raise InputError(path, where, f"unknown word {excerpt(word)} in the hierarchy: {_EXPECTED}")
     where = f"line {number}"
     if not joints:
         raise InputError(path, where, "no ROOT joint before MOTION")
@@ -186,7 +208,9 @@ def _numbers(path: Path, where: str, label: str, tokens: list[str], count: int) 
     return values[0], values[1], values[2]
 
 
-def _parse_motion(path: Path, text: str, start: int, joints: list[BvhJoint]) -> tuple[float, Array]:
+def _parse_motion(
+    path: Path, text: str, start: int, joints: list[BvhJoint], timed: bool, notes: list[str]
+) -> tuple[str, Array]:
     n_channels = sum(len(j.channels or ()) for j in joints)
     number = text.count("\n", 0, start) + 1
     fields: dict[str, tuple[str, int]] = {}
@@ -197,13 +221,12 @@ def _parse_motion(path: Path, text: str, start: int, joints: list[BvhJoint]) -> 
         number += 1
         line = text[position : min(stop, position + 200)].strip()
         position = stop + 1
-        if not line:
+        if not line or line.startswith(_COMMENT):
             continue
-        key, colon, value = line.partition(":")
-        key = " ".join(key.lower().split())
-        if not colon or key not in ("frames", "frame time"):
+        match = _FIELD.fullmatch(line)
+        if match is None:
             raise InputError(path, f"line {number}", f"expected 'Frames:' and 'Frame Time:', found {excerpt(line)}")
-        fields[key] = (value.strip(), number)
+        fields["frames" if match[1].lower() == "frames" else "frame time"] = (match[3].strip(), number)
     for key in ("frames", "frame time"):
         if key not in fields:
             raise InputError(path, f"line {number}", f"the file ends before '{key.title()}:'")
@@ -213,52 +236,85 @@ def _parse_motion(path: Path, text: str, start: int, joints: list[BvhJoint]) -> 
         raise InputError(path, f"line {where}", f"Frames must be a positive whole number, got {excerpt(value)}")
     frames = int(value)
     room = len(text) - position
-    if frames * n_channels * 2 > room + 2:  # a number and the blank after it take two bytes at least
+    least = frames - _slip(frames)
+    if least * n_channels * 2 > room + 2:  # a number and the blank after it take two bytes at least
         cause = f"{frames} frames of {n_channels} numbers announced, only {max(room, 0)} bytes follow: cut short"
         raise InputError(path, f"line {where}", cause)
     # Every joint becomes a translation in time, channels or not, and the root a pose.
     check_values(path, f"line {where}", frames, n_channels + 3 * len(joints) + 12)
     value, where = fields["frame time"]
+    if timed:
+        _check_time(path, where, value)
+    values = _parse_frames(path, text, position, number + 1, frames, n_channels, notes)
+    if len(values) != frames:
+        notes.append(f"{frames} frames are announced and {len(values)} are there: those were read")
+    return value, values
+
+
+def _check_time(path: Path, where: int, value: str) -> None:
+    way = "the option fps gives the frame rate instead"
     try:
         frame_time = float(value)
     except ValueError:
-        raise InputError(path, f"line {where}", f"Frame Time {excerpt(value)} is not a number") from None
+        raise InputError(path, f"line {where}", f"Frame Time {excerpt(value)} is not a number; {way}") from None
     if not (math.isfinite(frame_time) and 1e-5 <= frame_time <= 10.0):
-        raise InputError(path, f"line {where}", f"Frame Time {excerpt(value)} s is not between 1e-5 and 10")
-    return frame_time, _parse_frames(path, text, position, number + 1, frames, n_channels)
+        raise InputError(path, f"line {where}", f"Frame Time {excerpt(value)} s is not between 1e-5 and 10; {way}")
 
 
-def _parse_frames(path: Path, text: str, start: int, first_line: int, frames: int, n_channels: int) -> Array:
-    """The motion block ``[frames, n_channels]``; every line that is not blank is a frame."""
+def _slip(frames: int) -> int:
+    """By how many frames the announced number may be wrong: some writers count one too many or too few.
+
+    In a file of a few frames one more or less is damage.
+    """
+    return 1 if frames >= _LEAST_FOR_A_SLIP else 0
+
+
+def _parse_frames(
+    path: Path, text: str, start: int, first_line: int, frames: int, n_channels: int, notes: list[str]
+) -> Array:
+    """The motion block ``[frames, n_channels]``; every line that is neither blank nor a comment is a frame."""
     longest, rows, number, position = _MAX_NUMBER_CHARACTERS * n_channels + 1024, 0, first_line, start
+    kept: list[str] = []  # pieces of the text, from where the first line had to be changed
+    copied, mended = start, 0
     while position < len(text):
         stop = text.find("\n", position)
         stop = len(text) if stop < 0 else stop
         if stop - position > longest:
             cause = f"{stop - position} characters long; {n_channels} numbers do not take as many"
             raise InputError(path, f"line {number}", cause)
-        count = len(text[position:stop].split())
+        line = text[position:stop]
+        count = len(line.split())
+        if count and line.lstrip().startswith(_COMMENT):
+            kept.append(text[copied:position])
+            copied, count = stop, 0
         if count:
             rows += 1
-            if rows > frames:
-                raise InputError(path, f"line {number}", f"more than the {frames} frames announced")
-            if count != n_channels:
-                cause = f"frame {rows} of {frames} has {count} numbers, the hierarchy has {n_channels} channels"
+            if rows > frames + _slip(frames):
+                cause = f"more than the {frames} frames announced (if they belong to it, correct 'Frames:')"
                 raise InputError(path, f"line {number}", cause)
+            if count != n_channels:
+                words = numbers_apart(line, n_channels)
+                if len(words) != n_channels:
+                    cause = f"frame {rows} of {frames} has {count} numbers, the hierarchy has {n_channels} channels"
+                    raise InputError(path, f"line {number}", cause)
+                kept += [text[copied:position], " ".join(words)]
+                copied, mended = stop, mended + 1
         position, number = stop + 1, number + 1
-    if rows != frames:
-        raise InputError(
-            path, f"line {number - 1}", f"{frames} frames announced, the file ends after {rows}: cut short"
-        )
+    if rows < frames - _slip(frames):
+        cause = f"{frames} frames announced, the file ends after {rows}: cut short (if not, correct 'Frames:')"
+        raise InputError(path, f"line {number - 1}", cause)
+    if mended:
+        notes.append(f"{mended} lines hold numbers without a blank between them: they were told apart")
+    text, start, first_line = ("".join([*kept, text[copied:]]), 0, first_line) if kept else (text, start, first_line)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)  # NumPy's way of saying it stopped at a word
         try:
             values = np.fromstring(text[start:], sep=" ")
         except ValueError:
             values = np.empty(0)
-    if values.size != frames * n_channels or not (np.abs(values) < _MAX_VALUE).all():
+    if values.size != rows * n_channels or not (np.abs(values) < _MAX_VALUE).all():
         _blame(path, text, start, first_line)
-    return values.reshape(frames, n_channels)
+    return values.reshape(rows, n_channels)
 
 
 def _blame(path: Path, text: str, start: int, first_line: int) -> None:

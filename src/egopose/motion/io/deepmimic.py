@@ -15,7 +15,7 @@ from scipy.spatial.transform import Slerp
 from egopose.core.errors import InputError
 from egopose.motion import rotations as rot
 from egopose.motion.io._files import read_text
-from egopose.motion.io.frames import euler_angles, frame_rate, up_rotation
+from egopose.motion.io.frames import euler_angles, frame_rate, given_rate, given_up, up_rotation
 from egopose.motion.motion import Motion
 from egopose.motion.rotations import Array
 from egopose.motion.skeleton import Joint, Skeleton, hinges
@@ -65,8 +65,14 @@ def _skeleton() -> Skeleton:
 DEEPMIMIC_SKELETON = _skeleton()
 
 
-def read_deepmimic(path: str | Path) -> Motion:
+def read_deepmimic(path: str | Path, *, up: str = "auto", fps: float | None = None, encoding: str = "auto") -> Motion:
     """Read a DeepMimic clip; frames of uneven duration are resampled to the commonest rate.
+
+    Args:
+        path: the file.
+        up: its up axis; ``"auto"``: y, as the format has it.
+        fps: frames per second, in place of the frames' durations.
+        encoding: of the text, see :func:`egopose.motion.io._files.read_text`.
 
     Returns:
         z up, facing +x at the identity. ``meta["loop"]`` is the file's ``Loop``.
@@ -76,7 +82,10 @@ def read_deepmimic(path: str | Path) -> Motion:
             a quaternion of a length outside 0.1 to 2 (others are normalised).
     """
     path = Path(path)
-    loop, frames = _parse(path)
+    up = "y" if given_up(path, up) == "auto" else up
+    loop, frames = _parse(path, encoding)
+    if fps is not None:
+        frames[:, 0] = 1.0 / given_rate(path, fps)
     durations = frames[:, 0]
     if len(frames) > 1 and not (durations[:-1] > 0).all():
         bad = int(np.argmax(durations[:-1] <= 0))
@@ -84,7 +93,7 @@ def read_deepmimic(path: str | Path) -> Motion:
     step = float(np.median(durations[:-1])) if len(frames) > 1 else float(durations[0])
     if not 1e-5 <= step <= 10.0:
         raise InputError(path, "Frames", f"duration {step:g} s is not between 1e-5 and 10")
-    fps = frame_rate(step)
+    fps = frame_rate(step) if fps is None else fps
     times = np.concatenate([[0.0], np.cumsum(durations[:-1])])
     even = len(frames) == 1 or bool(np.abs(durations[:-1] - step).max() < 1e-3 * step)
     if not even and times[-1] * fps > 10 * len(frames):
@@ -107,7 +116,7 @@ def read_deepmimic(path: str | Path) -> Motion:
             return rot.continuous(rot.normalize(quats))
         return rot.continuous(rot.from_scipy(Slerp(times, rot.to_scipy(quats))(at), (len(at),)))
 
-    to_z_up = up_rotation("y")
+    to_z_up = up_rotation(up)
     columns = [rot.rotate(to_z_up, linear(frames[:, 1:4])), rot.multiply(to_z_up, ball(4))]
     column = 8
     for joint in DEEPMIMIC_SKELETON.joints[1:]:
@@ -117,13 +126,13 @@ def read_deepmimic(path: str | Path) -> Motion:
         elif len(joint.dofs) == 1:
             columns.append(linear(frames[:, column : column + 1]))
             column += 1
-    meta = {"format": "deepmimic", "source": path.name, "unit": "m", "unit_metres": 1.0, "up": "y", "loop": loop}
-    return Motion(DEEPMIMIC_SKELETON, np.concatenate(columns, axis=1), fps, name=path.stem, meta=meta)
+    meta = {"format": "deepmimic", "source": path.name, "unit": "m", "unit_metres": 1.0, "up": up, "loop": loop}
+    return Motion(DEEPMIMIC_SKELETON, np.concatenate(columns, axis=1), float(fps), name=path.stem, meta=meta)
 
 
-def _parse(path: Path) -> tuple[str, Array]:
+def _parse(path: Path, encoding: str) -> tuple[str, Array]:
     """The file's ``Loop`` and its frames ``[T, 44]``."""
-    text = read_text(path, _MAX_BYTES)
+    text = read_text(path, _MAX_BYTES, encoding)
     try:
         content = json.loads(text)
     except json.JSONDecodeError as error:

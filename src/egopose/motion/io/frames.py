@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+from decimal import ROUND_DOWN, ROUND_HALF_UP, Decimal
+from pathlib import Path
+
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from egopose.core.errors import InputError
 from egopose.motion import rotations as rot
 from egopose.motion.rotations import Array
 
 #: Metres a unit. ``asf`` is Acclaim's: CMU's skeletons state ``length 0.45``, and a value v is v / 0.45 inches.
-UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001, "inch": 0.0254, "asf": 0.0254 / 0.45}
+UNITS = {"m": 1.0, "dm": 0.1, "cm": 0.01, "mm": 0.001, "inch": 0.0254, "asf": 0.0254 / 0.45}
 
 #: Rotation vectors that take each up axis to +z; y up becomes z up by a quarter turn about x, so x stays.
 _UP_TO_Z = {
@@ -66,8 +70,58 @@ def _turn(difference: Array) -> Array:
     return np.abs((difference + np.pi) % (2 * np.pi) - np.pi)
 
 
-def frame_rate(seconds: float) -> float:
-    """Frames per second of a frame time written with few digits: 0.0083333 is 120, 0.0333667 stays 29.97."""
-    fps = 1.0 / seconds
+#: Rates that cameras, games and motion capture systems run at, per second; those of NTSC television apart.
+_CUSTOMARY: tuple[float, ...] = (
+    *(10, 12, 12.5, 15, 20, 24, 25, 30, 40, 48, 50, 60, 72, 75, 80, 90, 96, 100, 120, 144, 150, 180, 200, 240),
+    *(250, 300, 360, 400, 480, 500, 600, 960, 1000),
+)
+#: Of a number in text; more are not those of a time, and decimal arithmetic does not take them.
+_DIGITS = 25
+_NTSC = tuple(1000 * rate / 1001 for rate in (15, 24, 30, 60, 120, 240))
+
+
+def frame_rate(seconds: float | str) -> float:
+    """Frames per second of a frame time written with few digits: 0.0083333 and 0.008 are 120, 0.0333667 is 29.97.
+
+    The rate is the customary one whose frame time gives the written digits when it is rounded (or cut) to as many
+    decimals. Of several it is the nearest, but one of NTSC television only where no other fits. Where none fits, a
+    whole number within 0.05 % is taken, else what the digits say.
+
+    Args:
+        seconds: as written, where that is known; of a float the shortest way to write it counts.
+    """
+    value = float(seconds)
+    written = Decimal(seconds.strip() if isinstance(seconds, str) and len(seconds) < _DIGITS else repr(value))
+    for rounding in (ROUND_HALF_UP, ROUND_DOWN):
+        for rates in (_CUSTOMARY, _NTSC):
+            fitting = [r for r in rates if Decimal(1 / r).quantize(written, rounding) == written]
+            if fitting:
+                return float(min(fitting, key=lambda rate: abs(1 / rate - value)))
+    fps = 1.0 / value
     whole = round(fps)
     return float(whole) if whole and abs(fps - whole) < 5e-4 * whole else fps
+
+
+def given_rate(path: Path, fps: float) -> float:
+    """The option ``fps``. Raises InputError where it is no frame rate."""
+    if isinstance(fps, bool) or not isinstance(fps, int | float) or not 0.0 < fps <= 1e5:
+        raise InputError(path, "option fps", f"{fps!r:.40} is not a frame rate")
+    return float(fps)
+
+
+def given_up(path: Path, up: str) -> str:
+    """The option ``up``: ``"auto"`` or an axis. Raises InputError where it is none."""
+    if up != "auto" and up not in UP_AXES:
+        raise InputError(path, "option up", f"{up!r:.40} is none of auto, {', '.join(UP_AXES)}")
+    return up
+
+
+def given_unit(path: Path, unit: str | float) -> tuple[str, float] | None:
+    """The option ``unit`` as a name and metres, or None for ``"auto"``. Raises InputError where it is no unit."""
+    if unit == "auto":
+        return None
+    if isinstance(unit, str) and unit in UNITS:
+        return unit, UNITS[unit]
+    if isinstance(unit, int | float) and not isinstance(unit, bool) and np.isfinite(unit) and unit > 0:
+        return f"{float(unit):g} m", float(unit)
+    raise InputError(path, "option unit", f"{unit!r:.40} is none of auto, {', '.join(UNITS)} or metres a unit")

@@ -15,7 +15,7 @@ import numpy as np
 
 from egopose.core.errors import InputError
 from egopose.motion import rotations as rot
-from egopose.motion.io.body_size import STATURE_RANGE
+from egopose.motion.io.body_unit import STATURE_RANGE
 from egopose.motion.io.frames import UNITS, UP_AXES, up_rotation
 from egopose.motion.io.point_frames import bend_axis, carried, frame
 from egopose.motion.io.point_names import find_parts
