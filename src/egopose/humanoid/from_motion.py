@@ -16,7 +16,7 @@ from egopose.errors import InputError
 from egopose.humanoid.config import HumanoidConfig, SimConfig, Vector
 from egopose.humanoid.model import HumanoidModel, build_humanoid
 from egopose.motion.calibration import neutral_stance, part_positions
-from egopose.motion.mapping import SIDES, identify
+from egopose.motion.mapping import SIDES, identify, sample
 from egopose.motion.motion import Motion
 from egopose.motion.retarget import MODEL_PARTS, MODEL_SPINE, model_points
 from egopose.motion.rotations import Array
@@ -52,8 +52,8 @@ def config_from_motion(
     wanted = {*MODEL_PARTS.values(), *MODEL_SPINE}
     if missing := wanted - {row.name for row in config.joints}:
         raise InputError("conf/humanoid", "joints", f"a fitted humanoid needs {', '.join(sorted(missing))}")
-    body_map = identify(motion.skeleton, overrides)
     positions, quats = motion.forward_kinematics()
+    body_map = identify(motion.skeleton, overrides, sample(positions))
     points = part_positions(body_map, positions, quats, motion.skeleton)
     _, stance = neutral_stance(motion, body_map, quats, points)
     skeleton = config.skeleton()

@@ -27,7 +27,7 @@ from egopose.motion.calibration import (
 )
 from egopose.motion.inverse_kinematics import Targets, solve_in_time
 from egopose.motion.kinematics import forward_kinematics
-from egopose.motion.mapping import SIDES, BodyMap, identify
+from egopose.motion.mapping import SIDES, BodyMap, identify, sample
 from egopose.motion.motion import Motion
 from egopose.motion.rotations import Array
 from egopose.motion.skeleton import Skeleton
@@ -125,8 +125,8 @@ def retarget(
     Raises:
         InputError: the skeleton is not recognised as a humanoid.
     """
-    body_map = identify(motion.skeleton, overrides)
     positions, quats = motion.forward_kinematics()
+    body_map = identify(motion.skeleton, overrides, sample(positions))
     points = part_positions(body_map, positions, quats, motion.skeleton)
     model_rest = {part: p[0] for part, p in model_points(model, model.rest_qpos()[None]).items()}
     neutral, stance = neutral_stance(motion, body_map, quats, points)
@@ -208,12 +208,12 @@ def _limb_orientations(
     hinge = np.array(model.joints[model.index(MODEL_PARTS[lower])].dofs[0].axis)
     out = {}
     for part in (upper, lower):
-        frame = quats[:, body_map.parts[part]]
+        frame = quats[:, body_map.frame(part)]
         axis, evidence = bend_axis(frame, bones[upper], bones[lower])
         constant = None
         if evidence > _BEND_EVIDENCE:
             constant = align((bone_direction(frame, bones[part]), axis), (rest[part], hinge))
-        out[MODEL_PARTS[part]] = carried(body_map.parts[part], constant)
+        out[MODEL_PARTS[part]] = carried(body_map.frame(part), constant)
     return out
 
 
