@@ -129,8 +129,9 @@ def _body(rig: Rig) -> tuple[list[_Bone], Array]:
     phase = np.linspace(0.0, 2 * np.pi, frames)
     squat = 30.0 * (1 - np.cos(2 * phase)) / 2 if rig.squats else np.zeros(frames)
     heading = _turn("y", 40.0 * np.sin(phase / 2))
-    up = np.arange(frames) >= round((1 - rig.tiptoe) * frames)
-    rise = np.where(up, rig.rise, 0.0)
+    # The heels rise within a third of a second; a clip wholly on tiptoe begins so.
+    since = np.arange(frames) - round((1 - rig.tiptoe) * frames)
+    rise = rig.rise * (np.ones(frames) if rig.tiptoe >= 1 else np.clip(since / 10.0, 0.0, 1.0))
     knee = rig.knee + 2 * squat
     spine = heading * _turn("x", 0.3 * squat)
     bones = [_Bone("Hips", -1, np.zeros(3), heading)]

@@ -18,8 +18,8 @@ from egopose.humanoid.model import HumanoidModel, build_humanoid
 from egopose.motion.calibration import neutral_stance, part_positions
 from egopose.motion.mapping import SIDES, identify, sample
 from egopose.motion.motion import Motion
-from egopose.motion.retarget import MODEL_PARTS, MODEL_SPINE, model_points
 from egopose.motion.rotations import Array
+from egopose.motion.scaling import MODEL_PARTS, MODEL_SPINE, model_points
 
 
 def humanoid_from_motion(
@@ -55,7 +55,7 @@ def config_from_motion(
     positions, quats = motion.forward_kinematics()
     body_map = identify(motion.skeleton, overrides, sample(positions))
     points = part_positions(body_map, positions, quats, motion.skeleton)
-    _, stance = neutral_stance(motion, body_map, quats, points)
+    stance = neutral_stance(motion, body_map, quats, points).points
     skeleton = config.skeleton()
     rest = {part: p[0] for part, p in model_points(skeleton, skeleton.rest_qpos()[None]).items()}
     points["centre"] = (points["left_thigh"] + points["right_thigh"]) / 2

@@ -7,7 +7,7 @@ Rigs split long bones (MakeHuman's ``upperleg01 upperleg02``, Daz's ``Bend`` and
 from __future__ import annotations
 
 import re
-from itertools import combinations
+from itertools import combinations, pairwise
 
 import numpy as np
 
@@ -82,7 +82,7 @@ def _bends(points: Array) -> np.ndarray:
     length = np.linalg.norm(bones, axis=2)
     real = np.flatnonzero(np.median(length, axis=0) > 1e-3 * length.sum(axis=1).mean())
     out = np.zeros(points.shape[1] - 1, dtype=bool)
-    for before, after in zip(real[:-1], real[1:], strict=True):
+    for before, after in pairwise(real):
         cosine = np.sum(bones[:, before] * bones[:, after], axis=1) / (length[:, before] * length[:, after])
         low, middle, high = np.quantile(np.arccos(np.clip(cosine, -1.0, 1.0)), (0.02, 0.5, 0.98))
         out[after] = high - low > _BENDING or middle > _BENT
