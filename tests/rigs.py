@@ -44,7 +44,7 @@ class Rig:
         squats: whether the person squats.
         tiptoe: share of the clip, from its end, in which the person stands on the toes.
         rise: how far the foot is turned down then, degrees.
-        world: a turn of the whole clip about the hips, a rotation vector in degrees.
+        world: a turn of the whole body about the first hips, a rotation vector in degrees.
         rest_world: the rest pose turned as well (an export for another up axis).
         height: what the whole body is scaled by.
         folded: the rest pose lays every bone along y, and means nothing.
@@ -86,7 +86,7 @@ def write_rig(rig: Rig, path: Path) -> Path:
     world, rest = (Rotation.from_rotvec(r, degrees=True) for r in (rig.world, rig.rest_world))
     # A joint's own axes in the body's rest axes: all as the file's, or its bone along y.
     axes = [_fold(bones, i) if rig.folded else rest.inv() for i in range(len(bones))]
-    lines, columns = ["HIERARCHY"], [rig.height * (world.apply(root - root[:1]) + root[:1])]
+    lines, columns = ["HIERARCHY"], [rig.height * (world.apply(root - root[:1]) + rest.apply(root[:1]))]
 
     def write(index: int, level: int) -> None:
         bone, pad = bones[index], "  " * level
