@@ -31,7 +31,7 @@ from egopose.vision.lens import Camera
 
 #: Raise it whenever changed code gives another reference, video or flow for unchanged settings and sources: reading of
 #: motion files, retargeting, settling, making of the humanoid, rendering, optical flow. Stores are then made anew.
-PREPARATION_VERSION = 2
+PREPARATION_VERSION = 3
 
 
 def humanoid_of(config: Mapping[str, Any]) -> HumanoidModel:

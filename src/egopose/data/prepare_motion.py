@@ -11,7 +11,7 @@ from scipy.signal import butter, sosfiltfilt
 
 from egopose.data.reference import reference_states
 from egopose.humanoid.model import HumanoidModel
-from egopose.humanoid.soles import sole_edges, sole_names, sole_positions
+from egopose.humanoid.soles import lowest_points, sole_edges, sole_names, sole_positions
 from egopose.motion import rotations as rot
 from egopose.motion.motion import Motion
 from egopose.motion.plant import plant_feet
@@ -101,6 +101,7 @@ def reference_motion(
         settings.settle,
         sole_edges=sole_edges(humanoid, clip),
         center_of_mass=reference_states(humanoid, clip)["com"].numpy(),
+        lowest=lowest_points(humanoid, clip),
     )
     clip = plant_feet(
         clip,

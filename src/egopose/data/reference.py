@@ -8,6 +8,7 @@ import torch
 from tensordict import TensorDict
 
 from egopose.humanoid.model import HumanoidModel
+from egopose.humanoid.soles import lowest_points
 from egopose.motion.motion import Motion, finite_difference
 
 
@@ -84,10 +85,13 @@ def supported(humanoid: HumanoidModel, states: TensorDict, contacts: np.ndarray,
     """
     falls = falls_freely(states["com"].numpy(), fps)
     lowest = states["xpos"][:, :, 2].numpy().min(axis=1)
-    # Hands, knees or seat on the floor: some joint is as low as a sole's joint ever is.
-    near_floor = lowest < _LOW_JOINT
+    # Hands, knees or seat on the floor: some joint is as low as a sole's joint ever is, or the body's surface touches.
+    clip = Motion(humanoid.skeleton, states["qpos"].numpy(), fps)
+    near_floor = (lowest < _LOW_JOINT) | (lowest_points(humanoid, clip) < _TOUCH)
     return contacts.any(axis=1) | falls | near_floor
 
 
 #: A joint this low (m) means that some part of the body lies or stands on the floor.
 _LOW_JOINT = 0.13
+#: Settled bodies rest within this of the floor, m.
+_TOUCH = 0.02
