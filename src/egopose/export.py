@@ -45,6 +45,7 @@ def run_export(source: Path, files: Sequence[str], config: Mapping[str, Any]) ->
             motion; names it.
     """
     from egopose.motion.io import WRITERS, read_motion, write_motion, writer_suffix
+    from egopose.motion.plausibility import source_findings, tell
 
     if not files:
         raise InputError("export", "to", f"says no file; endings are {', '.join(WRITERS)}")
@@ -61,6 +62,8 @@ def run_export(source: Path, files: Sequence[str], config: Mapping[str, Any]) ->
     written = []
     for take, path in motions.items():
         motion = read_motion(path)
+        if path == source:
+            tell(source_findings(motion), take, lambda line: print(line, file=sys.stderr))
         if enabled is not False and (needed or held) and motion.ground_reaction is None:
             motion = _with_forces(motion, source, config, required=needed or enabled is True)
         for file, suffix in suffixes.items():

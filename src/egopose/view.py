@@ -64,6 +64,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     try:
         if find_spec("viser") is None:
             raise InputError("view", "viser", "is not installed; pip install 'egopose[view]'")
+        from egopose.motion.plausibility import source_findings, tell
         from egopose.viewer.app import Viewer
         from egopose.viewer.clip import Footage
         from egopose.viewer.door import Address
@@ -88,7 +89,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
         else:
             if footage is not None:
                 probe_video(footage.path)
-            viewer = Viewer(read_runs(sources, footage), address, find_sync, overrides)
+            runs = read_runs(sources, footage)
+            for source, run in zip(sources, runs, strict=True):
+                for name, clip in run.clips.items() if Path(source).is_file() else ():
+                    tell(source_findings(clip.motion), name, lambda line: print(line, file=sys.stderr))
+            viewer = Viewer(runs, address, find_sync, overrides)
     except InputError as error:
         print(f"error: {error}", file=sys.stderr)
         raise SystemExit(2) from None

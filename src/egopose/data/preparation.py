@@ -157,6 +157,7 @@ def _row(
         supported=runs_of(feasible),
         retargeting_mm=float(np.mean([mean for mean, _ in report.position_mm.values()])),
         camera=asdict(source.camera) if source.camera else None,
+        warnings=report.warnings,
     )
 
 

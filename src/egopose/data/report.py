@@ -6,7 +6,7 @@ from egopose.data.store import TakeInfo, TakeStore
 
 
 def store_report(store: TakeStore) -> str:
-    """A table of the takes: length, retargeting error, share of frames on the floor, origin of the video."""
+    """A table of the takes: length, retargeting error, share of frames on the floor, origin of the video; warnings."""
     lines = [f"{'take':<34}{'subject':>9}{'frames':>8}{'seconds':>9}{'retarget mm':>13}{'on floor':>10}  video"]
     for take in store.takes:
         feasible = sum(b - a for a, b in take.supported) / take.length
@@ -14,6 +14,7 @@ def store_report(store: TakeStore) -> str:
             f"{take.name:<34}{take.subject:>9}{take.length:>8}{take.length / store.fps:>9.1f}"
             f"{take.retargeting_mm:>13.1f}{feasible:>10.0%}  {_video(take)}"
         )
+    lines += [f"warning: {take.name}: {line}" for take in store.takes for line in take.warnings]
     total = store.frames_total
     lines.append(f"{len(store.takes)} takes, {total} frames, {total / store.fps / 60:.1f} min: {store.root}")
     return "\n".join(lines)

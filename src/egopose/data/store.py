@@ -53,6 +53,7 @@ class TakeInfo:
         supported: ``[[start, stop], ...]`` frames in which a body on a bare floor could be in.
         retargeting_mm: mean distance of the retargeted joints to their source, mm.
         camera: settings of :class:`egopose.vision.lens.Camera` of a user's own video, or None.
+        warnings: what is odd about the motion, see :mod:`egopose.motion.plausibility`.
     """
 
     name: str
@@ -67,6 +68,7 @@ class TakeInfo:
     supported: tuple[tuple[int, int], ...]
     retargeting_mm: float
     camera: Any = None
+    warnings: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)

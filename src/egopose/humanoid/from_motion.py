@@ -18,6 +18,7 @@ from egopose.humanoid.model import HumanoidModel, build_humanoid
 from egopose.motion.calibration import neutral_stance, part_positions
 from egopose.motion.mapping import SIDES, identify, sample
 from egopose.motion.motion import Motion
+from egopose.motion.plausibility import refuse, source_findings
 from egopose.motion.rotations import Array
 from egopose.motion.scaling import MODEL_PARTS, MODEL_SPINE, model_points
 
@@ -37,7 +38,8 @@ def humanoid_from_motion(
         overrides: part -> source joint, see :func:`egopose.motion.mapping.identify`.
 
     Raises:
-        InputError: the skeleton is not recognised as a humanoid, or the config's joints are not the default table's.
+        InputError: the skeleton is not recognised as a humanoid or is no person's, or the config's joints are not the
+            default table's.
     """
     return build_humanoid(config_from_motion(motion, config, overrides), sim)
 
@@ -55,6 +57,7 @@ def config_from_motion(
     positions, quats = motion.forward_kinematics()
     body_map = identify(motion.skeleton, overrides, sample(positions))
     points = part_positions(body_map, positions, quats, motion.skeleton)
+    refuse(source_findings(motion, overrides), motion.meta.get("source") or motion.name or "motion")
     stance = neutral_stance(motion, body_map, quats, points).points
     skeleton = config.skeleton()
     rest = {part: p[0] for part, p in model_points(skeleton, skeleton.rest_qpos()[None]).items()}

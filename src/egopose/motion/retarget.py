@@ -8,7 +8,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -48,6 +48,8 @@ class RetargetReport:
         unmapped: source bones that were dropped.
         scale: model leg length / source leg length.
         ground_shift_m: vertical shift that put the soles on the floor (mean, smallest, largest over the frames).
+        worst_frame: part -> the frame of its largest distance.
+        warnings: what is odd about the clip, see :mod:`egopose.motion.plausibility`.
     """
 
     position_mm: dict[str, tuple[float, float]]
@@ -56,6 +58,8 @@ class RetargetReport:
     unmapped: tuple[str, ...]
     scale: float
     ground_shift_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    worst_frame: dict[str, int] = field(default_factory=dict)
+    warnings: tuple[str, ...] = ()
 
     def table(self) -> str:
         """The report as text, worst joints first."""
@@ -69,6 +73,7 @@ class RetargetReport:
         if self.at_limit:
             lines.append("at a limit: " + ", ".join(f"{k} {v:.0%}" for k, v in self.at_limit.items()))
         lines.append("dropped bones: " + (", ".join(self.unmapped) or "none"))
+        lines += [f"warning: {line}" for line in self.warnings]
         return "\n".join(lines)
 
 
@@ -236,10 +241,11 @@ def _report(
 ) -> RetargetReport:
     _, quats = forward_kinematics(model, qpos)
     reached = model_points(model, qpos)
-    mm, degrees = {}, {}
+    mm, degrees, worst = {}, {}, {}
     for part, target in scaled.items():
         distance = 1000 * np.linalg.norm(reached[part] - target, axis=1)
         mm[part] = (float(distance.mean()), float(distance.max()))
+        worst[part] = int(distance.argmax())
     for part, name in MODEL_PARTS.items():
         if part in body_map.parts:
             off = rot.multiply(rot.conjugate(orientations[name]), quats[:, model.index(name)])
@@ -249,4 +255,4 @@ def _report(
     stuck = ((joints <= limits[:, 0] + 1e-6) | (joints >= limits[:, 1] - 1e-6)).mean(axis=0)
     names = [f"{j.name}_{k}" for j in model.joints for k in range(len(j.dofs))]
     at_limit = {n: float(s) for n, s in zip(names, stuck, strict=True) if s > 0}
-    return RetargetReport(mm, degrees, at_limit, body_map.unmapped, scale)
+    return RetargetReport(mm, degrees, at_limit, body_map.unmapped, scale, worst_frame=worst)
