@@ -28,8 +28,8 @@ def run(overrides: Sequence[str], rounds: int) -> dict[str, Any]:
     import numpy as np
 
     from egopose.config import compose_config
-    from egopose.data.prepare_motion import PreparationSettings, reference_motion, without_lead_in
     from egopose.data.preparation import humanoid_of
+    from egopose.data.prepare_motion import PreparationSettings, reference_motion, without_lead_in
     from egopose.data.sources import find_sources
     from egopose.motion.io import read_motion
     from egopose.motion.retarget import retarget

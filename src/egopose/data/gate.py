@@ -34,6 +34,7 @@ from egopose.errors import InputError  # noqa: E402
 from egopose.humanoid.config import HumanoidConfig, SimConfig  # noqa: E402
 from egopose.humanoid.model import HumanoidModel, build_humanoid  # noqa: E402
 from egopose.humanoid.physics import BatchedPhysics  # noqa: E402
+from egopose.humanoid.soles import lowest_points  # noqa: E402
 from egopose.motion import rotations as rot  # noqa: E402
 from egopose.motion.io import read_motion  # noqa: E402
 from egopose.motion.motion import Motion  # noqa: E402
@@ -147,7 +148,7 @@ def feasible_starts(humanoid: HumanoidModel, clip: Motion) -> NDArray[np.int64]:
 def _frames(humanoid: HumanoidModel, clip: Motion, states: TensorDict) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """Frames ``[T]`` on the floor or in flight, and those among them that contact can have made."""
     assert clip.contacts is not None
-    on_floor = supported(humanoid, states, clip.contacts, clip.fps)
+    on_floor = supported(humanoid, states, clip.contacts, clip.fps, lowest_points(humanoid, clip))
     return on_floor, on_floor & (contact_residual(humanoid, clip) < LARGEST_RESIDUAL)
 
 

@@ -17,7 +17,11 @@ from egopose.motion.motion import Motion
 from egopose.motion.plant import plant_feet
 from egopose.motion.plausibility import floor_findings, refuse, retarget_findings, source_findings
 from egopose.motion.retarget import RetargetReport, retarget
+from egopose.motion.rotations import Array
 from egopose.motion.settle import SettleSettings, settle
+
+#: A posed body's joints move less than this in a frame, m.
+_STILL = 0.002
 
 
 @dataclass(frozen=True)
@@ -39,16 +43,26 @@ class PreparationSettings:
 
 
 def without_lead_in(motion: Motion) -> Motion:
-    """The motion without a first frame that is not of it: many exports begin with a T-pose.
+    """The motion without frames at its ends that are not of it: many exports begin or end with a T-pose.
 
-    It is told by its jump: some joint moves further into frame 1 than 0.15 m and five times as far as it usually does.
+    They are told by a jump: some joint moves further in one frame than 0.15 m and five times as far as it usually does.
+    Up to half a second of frames is left out where they stand quite still before (or after) the jump; one frame alone
+    has nothing to stand still against.
     """
     if len(motion) < 3:
         return motion
     positions, _ = motion.forward_kinematics()
     local = positions - positions[:, :1]
     jumps = np.linalg.norm(np.diff(local, axis=0), axis=2).max(axis=1)
-    return motion.slice(1, len(motion)) if jumps[0] > max(0.15, 5 * np.median(jumps[1:])) else motion
+    longest = min(round(0.5 * motion.fps), len(motion) // 2)
+    start, cut = _posed_frames(jumps, longest), _posed_frames(jumps[::-1], longest)
+    return motion.slice(start, len(motion) - cut) if start + cut < len(motion) else motion
+
+
+def _posed_frames(jumps: Array, longest: int) -> int:
+    """Frames before the first jump of ``jumps [T - 1]`` (m a frame), where they stand still; ``longest`` at most."""
+    far = np.flatnonzero(jumps[:longest] > max(0.15, 5 * np.median(jumps[1:])))
+    return int(far[0]) + 1 if len(far) and (jumps[: far[0]] < _STILL).all() else 0
 
 
 def low_pass(motion: Motion, cutoff_hz: float) -> Motion:

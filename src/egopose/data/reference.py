@@ -8,7 +8,6 @@ import torch
 from tensordict import TensorDict
 
 from egopose.humanoid.model import HumanoidModel
-from egopose.humanoid.soles import lowest_points
 from egopose.motion.motion import Motion, finite_difference
 
 
@@ -70,7 +69,13 @@ def falls_freely(com: np.ndarray, fps: float, window: float = 0.1) -> np.ndarray
     return np.convolve(np.pad(acceleration, reach, mode="edge"), kernel, mode="valid") < -0.5 * 9.81
 
 
-def supported(humanoid: HumanoidModel, states: TensorDict, contacts: np.ndarray, fps: float) -> np.ndarray:
+def supported(
+    humanoid: HumanoidModel,
+    states: TensorDict,
+    contacts: np.ndarray,
+    fps: float,
+    surface: np.ndarray | None = None,
+) -> np.ndarray:
     """Frames ``[T]`` a body on a bare floor could be in: a sole touches it, or the body really falls freely.
 
     Where the mocap's actor hung from or stood on something the scene does not hold, the centre of mass neither falls
@@ -82,12 +87,14 @@ def supported(humanoid: HumanoidModel, states: TensorDict, contacts: np.ndarray,
         states: of :func:`reference_states`.
         contacts: ``[T, K]`` of the sole points.
         fps: frames per second.
+        surface: ``[T]`` m, the lowest point of other bodies than feet (:func:`egopose.humanoid.soles.lowest_points`).
     """
     falls = falls_freely(states["com"].numpy(), fps)
     lowest = states["xpos"][:, :, 2].numpy().min(axis=1)
     # Hands, knees or seat on the floor: some joint is as low as a sole's joint ever is, or the body's surface touches.
-    clip = Motion(humanoid.skeleton, states["qpos"].numpy(), fps)
-    near_floor = (lowest < _LOW_JOINT) | (lowest_points(humanoid, clip) < _TOUCH)
+    near_floor = lowest < _LOW_JOINT
+    if surface is not None:
+        near_floor |= surface < _TOUCH
     return contacts.any(axis=1) | falls | near_floor
 
 

@@ -7,6 +7,7 @@ the clip (medians), and directions stay the table's: straight limbs, arms sidewa
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterable
 from dataclasses import replace
 
@@ -57,7 +58,8 @@ def config_from_motion(
     positions, quats = motion.forward_kinematics()
     body_map = identify(motion.skeleton, overrides, sample(positions))
     points = part_positions(body_map, positions, quats, motion.skeleton)
-    refuse(source_findings(motion, overrides), motion.meta.get("source") or motion.name or "motion")
+    for line in refuse(source_findings(motion, overrides), motion.meta.get("source") or motion.name or "motion"):
+        warnings.warn(line, stacklevel=2)
     stance = neutral_stance(motion, body_map, quats, points).points
     skeleton = config.skeleton()
     rest = {part: p[0] for part, p in model_points(skeleton, skeleton.rest_qpos()[None]).items()}

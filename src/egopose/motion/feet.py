@@ -22,6 +22,8 @@ _UP = np.array([0.0, 0.0, 1.0])
 _ON_TOES = np.deg2rad(15.0)
 #: A line that falls by less or by more may be drawn along an axis, not measured, rad.
 _LEVEL, _DOWN = np.deg2rad(5.0), np.deg2rad(75.0)
+#: A flat foot's line rises by this at most, rad.
+_RISES = np.deg2rad(-10.0)
 #: Then a foot that stands up to this much steeper than the model's is still a flat one, rad.
 _STEEP = np.deg2rad(12.0)
 
@@ -63,14 +65,14 @@ def foot_constants(feet: dict[str, Foot], stance: Stance, upright: Array, size: 
     falls = {
         side: _fall(foot, normal)
         for side, foot in feet.items()
-        if (normal := contact[side]) is not None and 0.0 <= _fall(foot, normal) <= _DOWN
+        if (normal := contact[side]) is not None and _RISES <= _fall(foot, normal) <= _DOWN
     }
     out = {}
     for side, foot in feet.items():
         model = angle_between(_UP, foot.model_toe) - np.pi / 2
         rest = rot.rotate(rot.conjugate(stance.orientations[foot.joint]), _UP) if stance.is_rest else None
         rig = None if rest is None else _fall(foot, rest)
-        if rig is None or not 0.0 <= rig <= _DOWN:
+        if rig is None or not _RISES <= rig <= _DOWN:
             # No rest pose: rigs are alike on both sides, so of two feet the flatter one shows it.
             flat, rest = min(falls.values(), default=model), None
         elif rig < _LEVEL and side in falls and falls[side] < model + _STEEP:

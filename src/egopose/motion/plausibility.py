@@ -23,8 +23,8 @@ from egopose.motion.mapping import SIDES, identify, sample
 from egopose.motion.motion import Motion
 from egopose.motion.rotations import Array
 
-#: m: small children to the tallest people.
-STATURE = (0.8, 2.3)
+#: m: small children to the tallest people; and what not even babies and giants reach, but wrong units do.
+STATURE, ANY_STATURE = (0.8, 2.3), (0.5, 3.0)
 #: Model's legs over the source's, for the sizes above and legs of any share.
 SCALE = (0.3, 3.0)
 #: mm between a retargeted part and its source: bounds of real rigs are a third of it.
@@ -81,9 +81,12 @@ def source_findings(motion: Motion, overrides: Mapping[str, str] | None = None) 
     height = stature(motion.skeleton, sample(positions))
     out = []
     if not STATURE[0] <= height <= STATURE[1]:
-        # Refused: with a wrong unit the clip's speeds and falls are wrong too. A puppet's unit can be set as a number.
+        # Refused where nobody is so tall: with a wrong unit the clip's speeds and falls are wrong too, and a puppet's
+        # unit can be set as a number.
+        severity = "warning" if ANY_STATURE[0] <= height <= ANY_STATURE[1] else "error"
         what = f"the person is {height:.3g} m tall"
-        out.append(Finding("error", what, None, None, height, "give the file's unit: reader.unit=cm, or metres a unit"))
+        option = "if the unit is wrong, give it: reader.unit=cm, or metres a unit"
+        out.append(Finding(severity, what, None, None, height, option))
     return [*out, *_posture(points, height, motion.fps), *_speeds(points, motion.fps)]
 
 
