@@ -119,7 +119,7 @@ def _offset(pad: str, vector: Array) -> str:
 
 def _fold(bones: list[_Bone], index: int) -> Rotation:
     children = [bone.offset for bone in bones if bone.parent == index] + bones[index].ends
-    along = children[0] if children else np.array([0.0, 1.0, 0.0])
+    along = next((c for c in children if np.linalg.norm(c) > 1e-6), np.array([0.0, 1.0, 0.0]))
     return Rotation.align_vectors(along[None], [[0.0, 1.0, 0.0]])[0]
 
 
