@@ -8,6 +8,7 @@ sync: how well the offset between a motion and its video is found.
 stream: live estimation: frames a second, latency by stage, late frames, memory.
 plan: looking ahead at test time beside the bare physics of it.
 resume: a training killed at random moments beside the same one left alone.
+retarget: frames a second that are put onto the humanoid, on one core.
 export: what every export format loses, by independent readers.
 """
 

@@ -7,6 +7,8 @@ from contextlib import contextmanager
 from functools import cache
 from typing import Any
 
+import torch
+
 
 @cache
 def enable_onednn_matmul() -> bool:
@@ -16,7 +18,6 @@ def enable_onednn_matmul() -> bool:
     there. Torch has no other switch for it than the one that *allows* oneDNN to round the factors to bfloat16, which it
     does on processors made for that. So the digits are looked at, and where they are fewer all stays as it was.
     """
-    import torch
 
     setting: Any = getattr(torch.backends.mkldnn, "matmul")  # noqa: B009 made when asked for: unknown to mypy
     before = setting.fp32_precision
@@ -33,7 +34,6 @@ def torch_threads(count: int) -> Iterator[None]:
 
     Both decide the last digits, and a body that falls tells them: the same figures again need the same of both.
     """
-    import torch
 
     enable_onednn_matmul()
     before = torch.get_num_threads()
@@ -45,7 +45,6 @@ def torch_threads(count: int) -> Iterator[None]:
 
 
 def _keeps_single_precision(rows: int, inner: int, columns: int) -> bool:
-    import torch
 
     generator = torch.Generator().manual_seed(0)
     a, b = (torch.randn(shape, generator=generator) for shape in ((rows, inner), (inner, columns)))

@@ -29,6 +29,7 @@ BENCHMARKS = {
     "features": 9,
     "scaling": 5,
     "rates": 3,
+    "retarget": 3,
     "export": 1,
     "sync": 8,
     "stream": 1,

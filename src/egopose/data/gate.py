@@ -29,6 +29,7 @@ from egopose.data.prepare_motion import PreparationSettings, reference_motion
 from egopose.data.reference import reference_states, supported
 from egopose.data.take_sources import TakeSource, find_sources
 from egopose.humanoid.config import HumanoidConfig, SimConfig
+from egopose.humanoid.foot_geometry import lowest_points
 from egopose.humanoid.model import HumanoidModel, build_humanoid
 from egopose.humanoid.physics import BatchedPhysics
 from egopose.motion import rotations as rot
@@ -144,7 +145,7 @@ def feasible_starts(humanoid: HumanoidModel, clip: Motion) -> NDArray[np.int64]:
 def _frames(humanoid: HumanoidModel, clip: Motion, states: TensorDict) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """Frames ``[T]`` on the floor or in flight, and those among them that contact can have made."""
     assert clip.contacts is not None
-    on_floor = supported(humanoid, states, clip.contacts, clip.fps)
+    on_floor = supported(humanoid, states, clip.contacts, clip.fps, lowest_points(humanoid, clip))
     return on_floor, on_floor & (contact_residual(humanoid, clip) < LARGEST_RESIDUAL)
 
 

@@ -22,6 +22,7 @@ from egopose.data.store import Fragment, TakeInfo, TakeStore, runs_of
 from egopose.data.sync import settings_of, sync_offset
 from egopose.data.take_sources import TakeSource, find_sources
 from egopose.humanoid.config import HumanoidConfig, SimConfig
+from egopose.humanoid.foot_geometry import lowest_points
 from egopose.humanoid.model import HumanoidModel, build_humanoid
 from egopose.motion.io import read_motion
 from egopose.motion.motion import Motion
@@ -118,9 +119,8 @@ def _make_motions(config: Mapping[str, Any], root: Path, progress: bool) -> Take
             clip, report = reference_motion(motion, humanoid, settings, source.mapping)
             body = reference_states(humanoid, clip)
             contacts = clip.contacts if clip.contacts is not None else np.ones((len(clip), 1), dtype=bool)
-            infos.append(
-                _row(source, clip, report, offset, body, supported(humanoid, body, contacts, clip.fps), humanoid)
-            )
+            feasible = supported(humanoid, body, contacts, clip.fps, lowest_points(humanoid, clip))
+            infos.append(_row(source, clip, report, offset, body, feasible, humanoid))
             clips.append(clip)
             states.append(body)
             offset += len(clip)
@@ -161,6 +161,7 @@ def _row(
         retargeting_mm=float(np.mean([mean for mean, _ in report.position_mm.values()])),
         camera=asdict(source.camera) if source.camera else None,
         notes=notes_of(clip),
+        warnings=report.warnings,
     )
 
 

@@ -10,13 +10,14 @@ import numpy as np
 from scipy.signal import butter, sosfiltfilt
 
 from egopose.data.reference import reference_states
-from egopose.humanoid.foot_geometry import sole_edges, sole_names, sole_positions
+from egopose.humanoid.foot_geometry import lowest_points, sole_edges, sole_names, sole_positions
 from egopose.humanoid.model import HumanoidModel
 from egopose.motion import rotations as rot
 from egopose.motion.foot_contact_ik import plant_feet
 from egopose.motion.ground_alignment import GroundAlignmentSettings, align_to_ground
 from egopose.motion.motion import Motion
 from egopose.motion.notes import with_note
+from egopose.motion.plausibility import floor_findings, refuse, retarget_findings, source_findings
 from egopose.motion.retarget import RetargetReport, retarget
 from egopose.motion.rotations import Array
 
@@ -133,10 +134,11 @@ def reference_motion(
         overrides: part -> source joint, see :func:`egopose.motion.mapping.identify`.
 
     Returns:
-        The reference clip with contacts of the four sole points, and the retargeting report.
+        The reference clip with contacts of the four sole points, and the retargeting report with warnings of what is
+        odd about it (:mod:`egopose.motion.plausibility`).
 
     Raises:
-        InputError: the skeleton is not recognised as a humanoid.
+        InputError: the skeleton is not recognised as a humanoid, or no person moves so.
     """
     settings = settings or PreparationSettings()
     fps = 1.0 / humanoid.control_dt
@@ -154,6 +156,7 @@ def reference_motion(
         settings.ground_alignment,
         sole_edges=sole_edges(humanoid, clip),
         center_of_mass=reference_states(humanoid, clip)["com"].numpy(),
+        lowest=lowest_points(humanoid, clip),
     )
     clip = plant_feet(
         clip,
@@ -166,4 +169,13 @@ def reference_motion(
     centred = clip.qpos.copy()
     centred[:, :2] -= centred[:1, :2]
     clip = replace(clip, qpos=centred)
-    return clip, replace(report, ground_shift_m=(float(shift.mean()), float(shift.min()), float(shift.max())))
+    soles = sole_positions(humanoid, clip).reshape(len(clip), 2, 2, 3)
+    contacts = np.asarray(clip.contacts).reshape(len(clip), 2, 2)
+    findings = [
+        *source_findings(source, overrides),
+        *retarget_findings(report.position_mm, report.worst_frame, report.scale),
+        *floor_findings(soles, contacts, lowest_points(humanoid, clip)),
+    ]
+    warnings = tuple(refuse(findings, motion.meta.get("source") or motion.name or "motion"))
+    shifts = (float(shift.mean()), float(shift.min()), float(shift.max()))
+    return clip, replace(report, ground_shift_m=shifts, warnings=warnings)

@@ -69,7 +69,13 @@ def falls_freely(com: np.ndarray, fps: float, window: float = 0.1) -> np.ndarray
     return np.convolve(np.pad(acceleration, reach, mode="edge"), kernel, mode="valid") < -0.5 * 9.81
 
 
-def supported(humanoid: HumanoidModel, states: TensorDict, contacts: np.ndarray, fps: float) -> np.ndarray:
+def supported(
+    humanoid: HumanoidModel,
+    states: TensorDict,
+    contacts: np.ndarray,
+    fps: float,
+    surface: np.ndarray | None = None,
+) -> np.ndarray:
     """Frames ``[T]`` a body on a bare floor could be in: a sole touches it, or the body really falls freely.
 
     Where the mocap's actor hung from or stood on something the scene does not hold, the centre of mass neither falls
@@ -81,13 +87,18 @@ def supported(humanoid: HumanoidModel, states: TensorDict, contacts: np.ndarray,
         states: of :func:`reference_states`.
         contacts: ``[T, K]`` of the sole points.
         fps: frames per second.
+        surface: ``[T]`` m, the lowest point of other bodies than feet (:func:`egopose.humanoid.foot_geometry.lowest_points`).
     """
     falls = falls_freely(states["com"].numpy(), fps)
     lowest = states["xpos"][:, :, 2].numpy().min(axis=1)
-    # Hands, knees or seat on the floor: some joint is as low as a sole's joint ever is.
+    # Hands, knees or seat on the floor: some joint is as low as a sole's joint ever is, or the body's surface touches.
     near_floor = lowest < _LOW_JOINT
+    if surface is not None:
+        near_floor |= surface < _TOUCH
     return contacts.any(axis=1) | falls | near_floor
 
 
 #: A joint this low (m) means that some part of the body lies or stands on the floor.
 _LOW_JOINT = 0.13
+#: Settled bodies rest within this of the floor, m.
+_TOUCH = 0.02

@@ -15,6 +15,7 @@ def store_report(store: TakeStore) -> str:
             f"{take.retargeting_mm:>13.1f}{feasible:>10.0%}  {_video(take)}"
         )
     lines += [f"{take.name}: {note}" for take in store.takes for note in take.notes]
+    lines += [f"warning: {take.name}: {line}" for take in store.takes for line in take.warnings]
     total = store.frames_total
     lines.append(f"{len(store.takes)} takes, {total} frames, {total / store.fps / 60:.1f} min: {store.root}")
     return "\n".join(lines)

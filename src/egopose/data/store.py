@@ -55,6 +55,7 @@ class TakeInfo:
         retargeting_mm: mean distance of the retargeted joints to their source, mm.
         camera: settings of :class:`egopose.vision.lens.Camera` of a user's own video, or None.
         notes: sentences on how its motion file was read.
+        warnings: what is odd about the motion, see :mod:`egopose.motion.plausibility`.
     """
 
     name: str
@@ -70,6 +71,7 @@ class TakeInfo:
     retargeting_mm: float
     camera: Any = None
     notes: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)

@@ -1,9 +1,10 @@
-"""Where a humanoid's soles are, and a body placed so that they are not in the floor."""
+"""Where a humanoid's soles and lowest points are, and a body placed so that they are not in the floor."""
 
 from __future__ import annotations
 
 from itertools import product
 
+import mujoco
 import numpy as np
 
 from egopose.humanoid.model import HumanoidModel
@@ -38,6 +39,32 @@ def _foot_corners(humanoid: HumanoidModel, motion: Motion, sides: tuple[int, ...
         for x, y, z in product((-1, 1), (-1, 1), sides):
             points.append(positions[:, foot] + rot.rotate(quats[:, foot], (centre + half * [x, y, z])[None]))
     return np.stack(points, axis=1)
+
+
+def lowest_points(humanoid: HumanoidModel, motion: Motion) -> Array:
+    """``[T]`` m: height of the body's lowest point but the feet's: hands, knees, back or head may carry it."""
+    model = humanoid.mj_model
+    positions, quats = motion.forward_kinematics()
+    out = np.full(len(motion), np.inf)
+    for joint, body in enumerate(humanoid.body_ids):
+        if joint in humanoid.feet:
+            continue
+        for geom in range(model.body_geomadr[body], model.body_geomadr[body] + model.body_geomnum[body]):
+            centre = positions[:, joint] + rot.rotate(quats[:, joint], model.geom_pos[geom][None])
+            turn = rot.multiply(quats[:, joint], model.geom_quat[geom][None])
+            # What of each of the shape's own axes points up, [T, 3].
+            vertical = rot.to_matrix(turn)[:, 2]
+            size, kind = model.geom_size[geom], model.geom_type[geom]
+            if kind == mujoco.mjtGeom.mjGEOM_CAPSULE:
+                reach = size[0] + size[1] * np.abs(vertical[:, 2])
+            elif kind == mujoco.mjtGeom.mjGEOM_ELLIPSOID:
+                reach = np.linalg.norm(size * vertical, axis=1)
+            elif kind == mujoco.mjtGeom.mjGEOM_BOX:
+                reach = np.abs(vertical) @ size
+            else:  # a sphere
+                reach = np.full(len(motion), size[0])
+            out = np.minimum(out, centre[:, 2] - reach)
+    return out
 
 
 def sole_names(humanoid: HumanoidModel) -> tuple[str, ...]:

@@ -7,6 +7,7 @@ the clip (medians), and directions stay the table's: straight limbs, arms sidewa
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterable
 from dataclasses import replace
 
@@ -16,10 +17,11 @@ from egopose.core.errors import InputError
 from egopose.humanoid.config import HumanoidConfig, SimConfig, Vector
 from egopose.humanoid.model import HumanoidModel, build_humanoid
 from egopose.motion.calibration import neutral_stance, part_positions
-from egopose.motion.mapping import SIDES, identify
+from egopose.motion.mapping import SIDES, identify, sample
 from egopose.motion.motion import Motion
-from egopose.motion.retarget import MODEL_PARTS, MODEL_SPINE, model_points
+from egopose.motion.plausibility import refuse, source_findings
 from egopose.motion.rotations import Array
+from egopose.motion.scaling import MODEL_PARTS, MODEL_SPINE, model_points
 
 
 def humanoid_from_motion(
@@ -37,7 +39,8 @@ def humanoid_from_motion(
         overrides: part -> source joint, see :func:`egopose.motion.mapping.identify`.
 
     Raises:
-        InputError: the skeleton is not recognised as a humanoid, or the config's joints are not the default table's.
+        InputError: the skeleton is not recognised as a humanoid or is no person's, or the config's joints are not the
+            default table's.
     """
     return build_humanoid(config_from_motion(motion, config, overrides), sim)
 
@@ -52,10 +55,12 @@ def config_from_motion(
     wanted = {*MODEL_PARTS.values(), *MODEL_SPINE}
     if missing := wanted - {row.name for row in config.joints}:
         raise InputError("conf/humanoid", "joints", f"a fitted humanoid needs {', '.join(sorted(missing))}")
-    body_map = identify(motion.skeleton, overrides)
     positions, quats = motion.forward_kinematics()
+    body_map = identify(motion.skeleton, overrides, sample(positions))
     points = part_positions(body_map, positions, quats, motion.skeleton)
-    _, stance = neutral_stance(motion, body_map, quats, points)
+    for line in refuse(source_findings(motion, overrides), motion.meta.get("source") or motion.name or "motion"):
+        warnings.warn(line, stacklevel=2)
+    stance = neutral_stance(motion, body_map, quats, points).points
     skeleton = config.skeleton()
     rest = {part: p[0] for part, p in model_points(skeleton, skeleton.rest_qpos()[None]).items()}
     points["centre"] = (points["left_thigh"] + points["right_thigh"]) / 2

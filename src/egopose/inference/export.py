@@ -22,6 +22,7 @@ from egopose.humanoid.model import HumanoidModel
 from egopose.motion.io import WRITERS, given_options, read_motion, write_motion, writer_suffix
 from egopose.motion.motion import Motion
 from egopose.motion.notes import tell_notes
+from egopose.motion.plausibility import source_findings, tell
 
 _SOURCE = "conf/export.yaml"
 #: Endings of what cannot be written without forces, and of what holds them besides.
@@ -59,6 +60,8 @@ def run_export(source: Path, files: Sequence[str], config: Mapping[str, Any]) ->
     written = []
     for take, path in motions.items():
         motion = read_motion(path, **(given_options(config["reader"]) if path == source else {}))
+        if path == source:
+            tell(source_findings(motion), take, lambda line: print(line, file=sys.stderr))
         tell_notes(take, motion, lambda line: print(line, file=sys.stderr))
         if enabled is not False and (needed or held) and motion.ground_reaction is None:
             motion = _with_forces(motion, source, config, required=needed or enabled is True)

@@ -2,18 +2,20 @@
 
 Rigs disagree about their zero pose (some fold every bone onto one axis), so no pose is trusted further than it must be:
 
-* limbs: the bone's direction and the axis the elbow or knee bends about, both constant in the bone's own frame;
-* feet: the direction to the toes and the floor's normal while the foot stands flat;
+* limbs: the bone's direction and the axis the elbow or knee bends about (:mod:`egopose.motion.hinges`), both constant
+  in the bone's own frame;
+* feet: the direction to the toes and the sole's normal (:mod:`egopose.motion.feet`);
 * trunk, neck, head: the zero pose if it stands upright, else the mean of the clip's most upright frames.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from egopose.motion import rotations as rot
-from egopose.motion.contacts import point_speeds
 from egopose.motion.kinematics import forward_kinematics
 from egopose.motion.mapping import SIDES, BodyMap
 from egopose.motion.motion import Motion
@@ -79,20 +81,31 @@ def mean_rotation(quats: Array) -> Array:
     return rot.from_scipy(rot.to_scipy(quats).mean(), (1,))[0]
 
 
-def neutral_stance(
-    motion: Motion, body_map: BodyMap, quats: Array, points: dict[str, Array]
-) -> tuple[Array, dict[str, Array]]:
-    """An upright, forward-looking stance in its heading frame: orientations ``[J, 4]`` and part positions ``[3]``.
+@dataclass(frozen=True)
+class Stance:
+    """An upright, forward-looking stance in its heading frame.
 
-    The zero pose if it stands, else the mean of the clip's most upright frames.
+    Args:
+        orientations: ``[J, 4]`` of the source's joints.
+        points: part -> position ``[3]`` from the hips, m.
+        is_rest: it is the rest pose; else the mean of the clip's most upright frames.
     """
+
+    orientations: Array
+    points: dict[str, Array]
+    is_rest: bool
+
+
+def neutral_stance(motion: Motion, body_map: BodyMap, quats: Array, points: dict[str, Array]) -> Stance:
+    """The zero pose if it stands, else the mean of the clip's most upright frames."""
     zero = np.tile(motion.skeleton.rest_qpos(), (len(_AXIS_TURNS), 1))
     zero[:, 3:7] = _AXIS_TURNS
     zero_positions, zero_quats = forward_kinematics(motion.skeleton, zero)
     zero_points = part_positions(body_map, zero_positions, zero_quats, motion.skeleton)
     stands = uprightness(zero_points)
     best = int(np.argmax(stands))
-    if stands[best] > _UPRIGHT:
+    is_rest = bool(stands[best] > _UPRIGHT)
+    if is_rest:
         quats, points, frames = zero_quats, zero_points, np.arange(len(stands)) == best
     else:
         upright = uprightness(points)
@@ -101,7 +114,7 @@ def neutral_stance(
     relative = rot.multiply(turn[:, None], quats)[frames]
     orientations = np.stack([mean_rotation(relative[:, j]) for j in range(relative.shape[1])])
     stance = {part: rot.rotate(turn, p - points["hips"])[frames].mean(axis=0) for part, p in points.items()}
-    return orientations, stance
+    return Stance(orientations, stance, is_rest)
 
 
 def frame_from(first: Array, second: Array) -> Rotation:
@@ -129,31 +142,3 @@ def bone_direction(quats: Array, bone: Array) -> Array:
     """Mean direction ``[3]`` of a bone, world vectors ``[T, 3]``, in its own frame ``[T, 4]``."""
     local = rot.rotate(rot.conjugate(quats), bone)
     return local.mean(axis=0)
-
-
-def bend_axis(quats: Array, upper: Array, lower: Array) -> tuple[Array, float]:
-    """The axis a limb bends about, in the frame ``quats [T, 4]``, and the evidence for it.
-
-    Args:
-        quats: orientation of one of the limb's two bones.
-        upper, lower: ``[T, 3]`` world vectors of the two bones.
-
-    Returns:
-        Unit axis ``[3]`` (the turn that takes ``upper`` to ``lower``) and the mean sine of the bend.
-    """
-    normal = np.cross(upper, lower) / (np.linalg.norm(upper, axis=1) * np.linalg.norm(lower, axis=1) + 1e-12).reshape(
-        -1, 1
-    )
-    local = rot.rotate(rot.conjugate(quats), normal)
-    mean = local.mean(axis=0)
-    evidence = float(np.linalg.norm(mean))
-    return mean / max(evidence, 1e-12), evidence
-
-
-def floor_normal(quats: Array, ankle: Array, toe: Array, fps: float) -> Array:
-    """The floor's normal ``[3]`` in the foot's frame: the mean of up while the foot stands (low and slow)."""
-    speed = point_speeds(np.stack([ankle, toe], axis=1), fps).sum(axis=1)
-    height = ankle[:, 2] + toe[:, 2]
-    score = (height - np.quantile(height, 0.02)) / 0.05 + speed / 0.5
-    flat = score <= np.quantile(score, 0.2)
-    return rot.rotate(rot.conjugate(quats[flat]), np.broadcast_to(_UP, (int(flat.sum()), 3))).mean(axis=0)

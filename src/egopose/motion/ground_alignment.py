@@ -1,4 +1,4 @@
-"""Settle a clip on the floor: standing soles touch it, none is under it, and nothing else of the motion changes.
+"""Settle a clip on the floor: standing soles touch it, no part is under it, and nothing else of the motion changes.
 
 Mocap floats and sinks by centimetres as markers slip and bones are rescaled. A simulated body started from such a frame
 drops or is thrown up at once, which costs it the root's reward before it has done anything.
@@ -14,7 +14,6 @@ from scipy import sparse
 from scipy.ndimage import gaussian_filter1d, minimum_filter1d
 
 from egopose.motion.contacts import contact_labels
-from egopose.motion.ground import ground_height
 from egopose.motion.motion import Motion
 from egopose.motion.rotations import Array
 
@@ -55,6 +54,7 @@ def align_to_ground(
     *,
     sole_edges: Array | None = None,
     center_of_mass: Array | None = None,
+    lowest: Array | None = None,
 ) -> tuple[Motion, Array]:
     """The motion with its root moved up and down so that soles rest on the floor.
 
@@ -65,20 +65,24 @@ def align_to_ground(
         sole_edges: ``[T, E, 3]`` the soles' corners, m; default the sole points. A foot on its edge stands on these.
         center_of_mass: ``[T, 3]`` m. With it, a body near the floor that does not fall stands on the floor even where
             no sole point is slow enough to touch, and a body in the air falls as gravity has it.
+        lowest: ``[T]`` m height of the body's lowest point but the soles'. With it, a body that lies or stands on its
+            hands is put on the floor with what it rests on.
 
     Returns:
         The motion, with ``contacts [T, K]`` of its sole points; and the vertical shift of every frame ``[T]``, m.
     """
     settings = settings or GroundAlignmentSettings()
-    base = ground_height(sole_points, percentile=settings.percentile)
+    lowest_sole = sole_points[..., 2].min(axis=1)
+    lowest = lowest_sole if lowest is None else np.minimum(lowest_sole, lowest)
+    base = float(np.percentile(lowest, settings.percentile))
     # Capture floors tilt and rigs drift: the floor under a stride is the lowest a sole comes around it.
     window = max(1, round(settings.stride * motion.fps))
-    lowest_sole = sole_points[..., 2].min(axis=1) - base
-    drift = gaussian_filter1d(minimum_filter1d(lowest_sole, window, mode="nearest"), window / 3, mode="nearest")
+    drift = gaussian_filter1d(minimum_filter1d(lowest - base, window, mode="nearest"), window / 3, mode="nearest")
     floor = base + np.clip(drift, -settings.largest, settings.largest)
     points = sole_points - np.stack([np.zeros_like(floor), np.zeros_like(floor), floor], axis=1)[:, None]
     touching = contact_labels(points, motion.fps, height=settings.contact_height, speed=settings.contact_speed)
     edges = (points if sole_edges is None else sole_edges - (sole_points - points)[:, :1])[..., 2].min(axis=1)
+    edges = np.where(lowest < lowest_sole, np.minimum(edges, lowest - floor), edges)
     com_height = None if center_of_mass is None else center_of_mass[:, 2] - floor
     shift = _contact_shift(edges, np.asarray(touching.any(axis=1)), com_height, motion.fps, settings)
     shift = shift - floor - settings.depth

@@ -47,18 +47,21 @@ def _moves(skeleton: Skeleton) -> np.ndarray:
     return moves
 
 
-def _hinge_axes(skeleton: Skeleton, qpos: Array, quats: Array) -> Array:
-    """World axes ``[T, D, 3]`` of all degrees of freedom (hinges only)."""
-    axes = np.empty((len(qpos), skeleton.n_dofs, 3))
-    for j, joint in enumerate(skeleton.joints):
-        if not joint.dofs:
-            continue
+def _kinematics(skeleton: Skeleton, qpos: Array) -> tuple[Array, Array, Array]:
+    """:func:`forward_kinematics` and the world axes ``[T, D, 3]`` of all degrees of freedom (hinges only)."""
+    axes = np.array([dof.axis for joint in skeleton.joints for dof in joint.dofs])
+    turns = rot.from_axis_angle(axes, qpos[:, 7:])
+    positions, quats = np.empty((len(qpos), len(skeleton), 3)), np.empty((len(qpos), len(skeleton), 4))
+    world = np.empty((len(qpos), skeleton.n_dofs, 3))
+    positions[:, 0], quats[:, 0] = qpos[:, :3], qpos[:, 3:7]
+    for j, joint in enumerate(skeleton.joints[1:], start=1):
         frame = quats[:, joint.parent]
-        for column, dof in zip(range(*skeleton.dof_slices[j].indices(skeleton.n_dofs)), joint.dofs, strict=True):
-            axis = np.array(dof.axis)
-            axes[:, column] = rot.rotate(frame, np.broadcast_to(axis, (len(qpos), 3)))
-            frame = rot.multiply(frame, rot.from_axis_angle(axis, qpos[:, 7 + column]))
-    return axes
+        positions[:, j] = positions[:, joint.parent] + rot.rotate(frame, np.array(joint.offset))
+        for column in range(*skeleton.dof_slices[j].indices(skeleton.n_dofs)):
+            world[:, column] = rot.rotate(frame, axes[column])
+            frame = rot.multiply(frame, turns[:, column])
+        quats[:, j] = frame
+    return positions, quats, world
 
 
 def solve(
@@ -114,6 +117,8 @@ def solve_in_time(skeleton: Skeleton, start: Array, targets: Targets, limits: Ar
     return qpos
 
 
+#: A frame whose cost changes by a smaller share than this in a step has settled.
+_SETTLED = 1e-4
 #: Weighted root of the summed squared distances (m) above which a frame is tried again from its neighbours.
 _STUCK = 0.05
 
@@ -149,76 +154,101 @@ def _solve(
     damping: float,
     stay: float,
 ) -> Array:
-    n = skeleton.n_dofs
-    best, trial = start.copy(), start.copy()
-    normal, gradient, cost = _normal_equations(skeleton, trial, start, targets, stay)
+    """One chunk of :func:`solve`; a frame that has settled takes no part in further steps."""
+    best = start.copy()
+    active = np.arange(len(start))
+    normal, gradient, cost = _normal_equations(skeleton, start, start, targets, stay)
     squared = np.full(len(start), damping**2)
-    for iteration in range(iterations):
-        if iteration:
-            # A full step from a nearly straight limb can throw it anywhere: a worse frame goes back and steps shorter.
-            new_normal, new_gradient, new_cost = _normal_equations(skeleton, trial, start, targets, stay)
-            better = new_cost < cost
-            best[better], normal[better], gradient[better] = trial[better], new_normal[better], new_gradient[better]
-            cost[better] = new_cost[better]
-            squared = np.where(better, np.maximum(squared / 10, damping**2), squared * 30)
-        damped = normal + squared[:, None, None] * np.eye(6 + n)
-        pull = gradient.copy()
-        if limits is not None:
-            # A hinge pressed against its limit is held there, else the others would count on its moving on.
-            pressed = np.zeros(gradient.shape, dtype=bool)
-            pressed[:, 6:] = ((best[:, 7:] <= limits[:, 0]) & (gradient[:, 6:] < 0)) | (
-                (best[:, 7:] >= limits[:, 1]) & (gradient[:, 6:] > 0)
-            )
-            pull[pressed] = 0.0
-            free = ~pressed
-            damped *= free[:, :, None] & free[:, None, :]
-            damped += pressed[:, :, None] * np.eye(6 + n)
-        step = np.clip(np.linalg.solve(damped, pull[..., None])[..., 0], -0.5, 0.5)
-        trial = best.copy()
-        trial[:, :3] += step[:, :3]
-        trial[:, 3:7] = rot.normalize(rot.multiply(rot.from_rotvec(step[:, 3:6]), trial[:, 3:7]))
-        trial[:, 7:] += step[:, 6:]
-        if limits is not None:
-            trial[:, 7:] = np.clip(trial[:, 7:], limits[:, 0], limits[:, 1])
-    last = _cost(skeleton, trial, targets) + stay**2 * np.sum((trial - start)[:, 7:] ** 2, axis=1)
-    return np.where((last < cost)[:, None], trial, best)
+    for _ in range(iterations):
+        trial = _step(best[active], normal, gradient, squared, limits)
+        here = _part(targets, active)
+        new_normal, new_gradient, new_cost = _normal_equations(skeleton, trial, start[active], here, stay)
+        # A full step from a nearly straight limb can throw it anywhere: a worse frame goes back and steps shorter.
+        better = new_cost < cost
+        gain = cost - new_cost
+        settled = np.abs(gain) < _SETTLED * cost + 1e-12
+        best[active[better]] = trial[better]
+        normal[better], gradient[better], cost[better] = new_normal[better], new_gradient[better], new_cost[better]
+        squared = np.where(better, np.maximum(squared / 10, damping**2), squared * 30)
+        if settled.any():
+            going = ~settled
+            active, normal, gradient = active[going], normal[going], gradient[going]
+            cost, squared = cost[going], squared[going]
+        if not len(active):
+            break
+    return best
+
+
+def _step(qpos: Array, normal: Array, gradient: Array, squared: Array, limits: Array | None) -> Array:
+    """``qpos`` after a damped Gauss-Newton step, ``squared [T]`` being the damping's square."""
+    size = gradient.shape[1]
+    damped = normal.copy()
+    diagonal = np.arange(size)
+    damped[:, diagonal, diagonal] += squared[:, None]
+    pull = gradient.copy()
+    if limits is not None:
+        # A hinge pressed against its limit is held there, else the others would count on its moving on.
+        pressed = np.zeros(gradient.shape, dtype=bool)
+        pressed[:, 6:] = ((qpos[:, 7:] <= limits[:, 0]) & (gradient[:, 6:] < 0)) | (
+            (qpos[:, 7:] >= limits[:, 1]) & (gradient[:, 6:] > 0)
+        )
+        pull[pressed] = 0.0
+        frames, held = np.nonzero(pressed)
+        damped[frames, held, :] = 0.0
+        damped[frames, :, held] = 0.0
+        damped[frames, held, held] = 1.0
+    step = np.clip(np.linalg.solve(damped, pull[..., None])[..., 0], -0.5, 0.5)
+    out = qpos.copy()
+    out[:, :3] += step[:, :3]
+    out[:, 3:7] = rot.normalize(rot.multiply(rot.from_rotvec(step[:, 3:6]), out[:, 3:7]))
+    out[:, 7:] += step[:, 6:]
+    if limits is not None:
+        out[:, 7:] = np.clip(out[:, 7:], limits[:, 0], limits[:, 1])
+    return out
 
 
 def _normal_equations(
     skeleton: Skeleton, qpos: Array, start: Array, targets: Targets, stay: float
 ) -> tuple[Array, Array, Array]:
     """Gauss-Newton's matrix ``[T, 6 + D, 6 + D]``, right side ``[T, 6 + D]`` and the cost ``[T]`` (m^2) at ``qpos``."""
-    moves, n, frames = _moves(skeleton), skeleton.n_dofs, len(qpos)
+    n, frames = skeleton.n_dofs, len(qpos)
     w_p, w_o = targets.position_weight[:, None], targets.orientation_weight[:, None]
-    k, m = len(targets.point_joint), len(targets.frame_joint)
-    positions, quats = forward_kinematics(skeleton, qpos)
+    positions, quats, axes = _kinematics(skeleton, qpos)
     points = positions[:, targets.point_joint] + rot.rotate(quats[:, targets.point_joint], targets.point_offset[None])
-    axes = _hinge_axes(skeleton, qpos, quats)
-    origins = positions[:, skeleton.dof_joint]
-    jacobian = np.zeros((frames, 3 * (k + m), 6 + n))
-    arm = points[:, :, None] - origins[:, None]
-    turn = np.cross(np.broadcast_to(axes[:, None], arm.shape), arm) * moves[targets.point_joint][None, :, :, None]
-    jacobian[:, : 3 * k, 6:] = (turn * w_p[None, :, None]).transpose(0, 1, 3, 2).reshape(frames, 3 * k, n)
-    eye = np.eye(3)
-    jacobian[:, : 3 * k, :3] = (eye[None] * w_p[..., None]).reshape(3 * k, 3)
-    arm = points - positions[:, :1]
-    # d(point)/d(world rotation vector of the root) = -[arm]x
-    cross = np.zeros((frames, k, 3, 3))
-    cross[..., 0, 1], cross[..., 0, 2] = arm[..., 2], -arm[..., 1]
-    cross[..., 1, 0], cross[..., 1, 2] = -arm[..., 2], arm[..., 0]
-    cross[..., 2, 0], cross[..., 2, 1] = arm[..., 1], -arm[..., 0]
-    jacobian[:, : 3 * k, 3:6] = (cross * w_p[None, ..., None]).reshape(frames, 3 * k, 3)
-    spin = axes[:, None] * moves[targets.frame_joint][None, :, :, None]
-    jacobian[:, 3 * k :, 6:] = (spin * w_o[None, :, None]).transpose(0, 1, 3, 2).reshape(frames, 3 * m, n)
-    jacobian[:, 3 * k :, 3:6] = (eye[None] * w_o[..., None]).reshape(3 * m, 3)
     off = rot.multiply(targets.orientations, rot.conjugate(quats[:, targets.frame_joint]))
     residual = np.concatenate(
         [((targets.positions - points) * w_p).reshape(frames, -1), (rot.to_rotvec(off) * w_o).reshape(frames, -1)],
         axis=1,
     )
+    jacobian = _jacobian(skeleton, targets, positions, points, axes)
     moved = start[:, 7:] - qpos[:, 7:]
     normal = jacobian.transpose(0, 2, 1) @ jacobian
     normal[:, np.arange(6, 6 + n), np.arange(6, 6 + n)] += stay**2
-    gradient = np.einsum("tri,tr->ti", jacobian, residual)
+    gradient = (residual[:, None] @ jacobian)[:, 0]
     gradient[:, 6:] += stay**2 * moved
     return normal, gradient, np.sum(residual**2, axis=1) + stay**2 * np.sum(moved**2, axis=1)
+
+
+def _jacobian(skeleton: Skeleton, targets: Targets, positions: Array, points: Array, axes: Array) -> Array:
+    """``[T, 3 (K + M), 6 + D]``: the points' and the frames' weighted derivatives.
+
+    Columns: the root's position, its world rotation vector, the hinges.
+    """
+    moves, n, frames = _moves(skeleton), skeleton.n_dofs, len(axes)
+    k, m = len(targets.point_joint), len(targets.frame_joint)
+    # The root turns about the world's axes at its own place, as three more hinges that move everything.
+    turns = np.concatenate([np.broadcast_to(np.eye(3), (frames, 3, 3)), axes], axis=1)
+    origins = np.concatenate([np.repeat(positions[:, :1], 3, axis=1), positions[:, skeleton.dof_joint]], axis=1)
+    weight = np.ones((k + m, 3 + n))
+    weight[:k, 3:], weight[k:, 3:] = moves[targets.point_joint], moves[targets.frame_joint]
+    weight *= np.concatenate([targets.position_weight, targets.orientation_weight])[:, None]
+    out = np.zeros((frames, k + m, 3, 6 + n))
+    out[:, :k, :, :3] = np.eye(3) * targets.position_weight[:, None, None]
+    x, y, z = (turns[:, None, :, i] for i in range(3))
+    # axis x (point - origin) = axis x point + origin x axis: the second part is the same for every point.
+    rest = np.cross(origins, turns)
+    px, py, pz = (points[:, :, None, i] for i in range(3))
+    for i, product in enumerate((y * pz - z * py, z * px - x * pz, x * py - y * px)):
+        out[:, :k, i, 3:] = (product + rest[:, None, :, i]) * weight[:k]
+        out[:, k:, i, 3:] = turns[:, None, :, i] * weight[k:]
+    return out.reshape(frames, 3 * (k + m), 6 + n)

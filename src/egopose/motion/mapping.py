@@ -1,24 +1,25 @@
 """Which joint of a foreign skeleton plays which part of a human body.
 
 Only four words have to be recognised in the names (foot or ankle, hand or wrist, head or neck, and a side); the rest
-follows from the tree: the knee is the ankle's parent, the chest is where the arms meet, the hips are where the legs do.
+follows from the tree: knees and elbows are found by :mod:`egopose.motion.limbs`, the chest is where the arms meet, the
+hips are where the legs do.
 """
 
 from __future__ import annotations
 
-import itertools
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from egopose.core.errors import InputError
 from egopose.motion.joint_names import plain_name, plain_names
+from egopose.motion.kinematics import forward_kinematics
+from egopose.motion.limbs import HELPER, limb_joints
+from egopose.motion.rotations import Array
 from egopose.motion.skeleton import Skeleton
 
 SIDES = ("right", "left")
-#: Helper bones that stand in a limb's chain in some rigs and carry no joint of their own.
-_HELPER = re.compile(r"twist|share|roll|helper|nub|(?:^|[_.:])ik[_.]|(?-i:(?<=\w)IK(?![a-z]))", re.IGNORECASE)
 _LIMB_PARTS = ("thigh", "shin", "foot", "toe", "clavicle", "arm", "forearm", "hand")
 _PARTS = ("hips", "neck", "head", *(f"{side}_{part}" for side in SIDES for part in _LIMB_PARTS))
 
@@ -48,11 +49,18 @@ class BodyMap:
             clavicle arm forearm hand`` as ``right_thigh``; ``right_toe`` where there is one.
         spine: joint indices from the first spine joint to the chest (the parent of neck and arms), at least one.
         unmapped: names of the source joints that play no part.
+        frames: thigh and arm -> the last joint of that bone where it is made of several: the knee's axis stands still
+            in its frame.
     """
 
     parts: dict[str, int]
     spine: tuple[int, ...]
     unmapped: tuple[str, ...]
+    frames: dict[str, int] = field(default_factory=dict)
+
+    def frame(self, part: str) -> int:
+        """The joint whose orientation is the part's."""
+        return self.frames.get(part, self.parts[part])
 
 
 def side_of(name: str) -> str | None:
@@ -67,12 +75,14 @@ def side_of(name: str) -> str | None:
     return None
 
 
-def identify(skeleton: Skeleton, overrides: dict[str, str] | None = None) -> BodyMap:
+def identify(skeleton: Skeleton, overrides: dict[str, str] | None = None, positions: Array | None = None) -> BodyMap:
     """Find the parts of a humanoid skeleton.
 
     Args:
         skeleton: any humanoid tree.
         overrides: part -> joint name, for rigs whose names say too little.
+        positions: ``[T, J, 3]`` m, the joints in some frames of a clip: a limb of many bones is told by how it bends.
+            Default: the rest pose.
 
     Raises:
         InputError: a part cannot be found, or two parts would share a joint; names the part and the joints there are.
@@ -86,9 +96,22 @@ def identify(skeleton: Skeleton, overrides: dict[str, str] | None = None) -> Bod
         if name not in skeleton.names:
             raise InputError(skeleton.name or "skeleton", f"mapping.{part}", f"there is no joint {name!r}")
     parts: dict[str, int] = {part: skeleton.index(name) for part, name in overrides.items()}
-    for side in SIDES:
-        _limb(skeleton, parts, side, ("foot", "shin", "thigh"), ("ankle", "foot"))
-        _limb(skeleton, parts, side, ("hand", "forearm", "arm"), ("wrist", "hand"))
+    if positions is None:
+        positions = forward_kinematics(skeleton, skeleton.rest_qpos()[None])[0]
+    frames: dict[str, int] = {}
+    for roles, words in (
+        (("thigh", "shin", "foot"), ("ankle", "foot")),
+        (("arm", "forearm", "hand"), ("wrist", "hand")),
+    ):
+        for side in SIDES:
+            if f"{side}_{roles[-1]}" not in parts:
+                parts[f"{side}_{roles[-1]}"] = _find(skeleton, words, side, f"{side}_{roles[-1]}")
+        trunk = _common(skeleton, *(parts[f"{side}_{roles[-1]}"] for side in SIDES))
+        for side in SIDES:
+            _limb(skeleton, parts, side, roles, trunk, positions)
+            upper, lower = (f"{side}_{role}" for role in roles[:2])
+            if parts[upper] in _path(skeleton, parts[lower])[:-2]:
+                frames[upper] = int(skeleton.parents[parts[lower]])
     if "head" not in parts:
         parts["head"] = _find(skeleton, ("head", "neck"), None, "head")
     hips = parts.setdefault("hips", _common(skeleton, parts["left_thigh"], parts["right_thigh"]))
@@ -107,29 +130,37 @@ def identify(skeleton: Skeleton, overrides: dict[str, str] | None = None) -> Bod
     path = _path(skeleton, chest)
     trunk = _common(skeleton, hips, chest)
     spine = tuple(i for i in path[path.index(trunk) + 1 :] if i not in parts.values()) or (chest,)
-    used = set(parts.values()) | set(spine)
+    used = set(parts.values()) | set(spine) | set(frames.values())
     if len(set(parts.values())) != len(parts):
         raise InputError(
             skeleton.name or "skeleton", "mapping", f"one joint would play two parts: {_named(skeleton, parts)}"
         )
     unmapped = tuple(n for i, n in enumerate(skeleton.names) if i not in used)
-    return BodyMap(parts, spine, unmapped)
+    return BodyMap(parts, spine, unmapped, frames)
 
 
-def _limb(skeleton: Skeleton, parts: dict[str, int], side: str, roles: tuple[str, ...], words: tuple[str, ...]) -> None:
-    if f"{side}_{roles[0]}" not in parts:
-        parts[f"{side}_{roles[0]}"] = _find(skeleton, words, side, f"{side}_{roles[0]}")
-    for lower, upper in itertools.pairwise(roles):
-        if f"{side}_{upper}" in parts:
-            continue
-        index = int(skeleton.parents[parts[f"{side}_{lower}"]])
-        while index > 0 and _HELPER.search(plain_names(skeleton.names)[index]):
-            index = int(skeleton.parents[index])
-        if index <= 0:
-            raise InputError(
-                skeleton.name or "skeleton", f"mapping.{side}_{upper}", f"the {side} limb has too few joints"
-            )
-        parts[f"{side}_{upper}"] = index
+def sample(positions: Array, frames: int = 200) -> Array:
+    """Up to ``frames`` of ``[T, ...]``, evenly over the clip."""
+    return positions[np.unique(np.linspace(0, len(positions) - 1, frames).astype(int))]
+
+
+def _limb(
+    skeleton: Skeleton, parts: dict[str, int], side: str, roles: tuple[str, str, str], trunk: int, positions: Array
+) -> None:
+    """Add the limb's two upper parts to ``parts`` where an override has not."""
+    upper, lower, end = (f"{side}_{role}" for role in roles)
+    if upper in parts and lower in parts:
+        return
+    chain = _between(skeleton, trunk, parts[end])
+    found = limb_joints(skeleton, chain, parts[end], positions, (parts.get(upper), parts.get(lower)))
+    if found is None:
+        raise InputError(
+            skeleton.name or "skeleton",
+            f"mapping.{upper if lower in parts else lower}",
+            f"the {side} limb has too few joints",
+        )
+    parts.setdefault(upper, found[0])
+    parts.setdefault(lower, found[1])
 
 
 def _find(skeleton: Skeleton, words: tuple[str, ...], side: str | None, part: str) -> int:
@@ -138,7 +169,7 @@ def _find(skeleton: Skeleton, words: tuple[str, ...], side: str | None, part: st
         hits = [
             i
             for i, name in enumerate(plain_names(skeleton.names))
-            if re.search(word, name, re.IGNORECASE) and side_of(name) == side and not _HELPER.search(name)
+            if re.search(word, name, re.IGNORECASE) and side_of(name) == side and not HELPER.search(name)
         ]
         if hits:
             return min(hits, key=lambda i: len(_path(skeleton, i)))
@@ -151,7 +182,7 @@ def _find(skeleton: Skeleton, words: tuple[str, ...], side: str | None, part: st
 
 
 def _toe(skeleton: Skeleton, foot: int) -> int | None:
-    children = [i for i in skeleton.children(foot) if not _HELPER.search(plain_names(skeleton.names)[i])]
+    children = [i for i in skeleton.children(foot) if not HELPER.search(plain_names(skeleton.names)[i])]
     children = [i for i in children if np.linalg.norm(skeleton.offsets[i]) > 0.02]
     named = [i for i in children if re.search("toe|foot|ball", plain_names(skeleton.names)[i], re.IGNORECASE)]
     return (named or children or [None])[0]  # type: ignore[list-item]

@@ -8,68 +8,33 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from egopose.motion import rotations as rot
 from egopose.motion.calibration import (
+    Stance,
     align,
-    angle_between,
-    bend_axis,
     bone_direction,
-    floor_normal,
     mean_rotation,
     neutral_stance,
     part_positions,
+    uprightness,
 )
-from egopose.motion.inverse_kinematics import Targets, solve_in_time
+from egopose.motion.feet import Foot, foot_constants
+from egopose.motion.hinges import Limb, hinge_axes
+from egopose.motion.inverse_kinematics import solve_in_time
+from egopose.motion.joint_angles import read_angles
 from egopose.motion.kinematics import forward_kinematics
-from egopose.motion.mapping import SIDES, BodyMap, identify
+from egopose.motion.mapping import SIDES, BodyMap, identify, sample
 from egopose.motion.motion import Motion
 from egopose.motion.rotations import Array
+from egopose.motion.scaling import MODEL_PARTS, MODEL_SPINE, ik_targets, model_points, scaled_positions
 from egopose.motion.skeleton import Skeleton
 
-#: The model's joint for each part of :class:`BodyMap`; the spine is spread over the four spine joints.
-MODEL_PARTS = {"hips": "Hips", "neck": "Neck", "head": "Head"} | {
-    f"{side}_{part}": side.capitalize() + joint
-    for side in SIDES
-    for part, joint in {
-        "clavicle": "Shoulder",
-        "arm": "Arm",
-        "forearm": "ForeArm",
-        "hand": "Hand",
-        "thigh": "UpLeg",
-        "shin": "Leg",
-        "foot": "Foot",
-    }.items()
-}
-_UP = np.array([0.0, 0.0, 1.0])
-#: How far the angle between a foot's bone and the floor's normal may be from the model's, rad (20 degrees).
-_FLAT_FOOT = np.deg2rad(20.0)
-#: Mean sine of a limb's bend below which its bend axis is not known.
-_BEND_EVIDENCE = 0.05
-MODEL_SPINE = ("Spine", "Spine1", "Spine2", "Spine3")
-#: Links along which positions are scaled: part -> the part it is measured from.
-_LINKS = {"neck": "centre", "head": "neck", "crown": "neck"} | {
-    f"{side}_{part}": above if above in ("centre", "neck") else f"{side}_{above}"
-    for side in SIDES
-    for part, above in {
-        "thigh": "centre",
-        "shin": "thigh",
-        "foot": "shin",
-        "toe": "foot",
-        "arm": "neck",
-        "forearm": "arm",
-        "hand": "forearm",
-    }.items()
-}
-#: Links inside the trunk -> the model joint whose frame they are constant or nearly constant in.
-_TRUNK_LINKS = {"neck": "Hips", "head": "Neck", "crown": "Neck"} | {
-    f"{side}_{part}": joint for side in SIDES for part, joint in {"thigh": "Hips", "arm": "Spine3"}.items()
-}
+#: Legs of an adult from hip to ankle, m: heights and speeds that tell a standing foot are for such a one.
+_ADULT_LEGS = 0.85
 
 
 @dataclass(frozen=True)
@@ -83,6 +48,8 @@ class RetargetReport:
         unmapped: source bones that were dropped.
         scale: model leg length / source leg length.
         ground_shift_m: vertical shift that put the soles on the floor (mean, smallest, largest over the frames).
+        worst_frame: part -> the frame of its largest distance.
+        warnings: what is odd about the clip, see :mod:`egopose.motion.plausibility`.
     """
 
     position_mm: dict[str, tuple[float, float]]
@@ -91,6 +58,8 @@ class RetargetReport:
     unmapped: tuple[str, ...]
     scale: float
     ground_shift_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    worst_frame: dict[str, int] = field(default_factory=dict)
+    warnings: tuple[str, ...] = ()
 
     def table(self) -> str:
         """The report as text, worst joints first."""
@@ -104,6 +73,7 @@ class RetargetReport:
         if self.at_limit:
             lines.append("at a limit: " + ", ".join(f"{k} {v:.0%}" for k, v in self.at_limit.items()))
         lines.append("dropped bones: " + (", ".join(self.unmapped) or "none"))
+        lines += [f"warning: {line}" for line in self.warnings]
         return "\n".join(lines)
 
 
@@ -125,16 +95,16 @@ def retarget(
     Raises:
         InputError: the skeleton is not recognised as a humanoid.
     """
-    body_map = identify(motion.skeleton, overrides)
     positions, quats = motion.forward_kinematics()
+    body_map = identify(motion.skeleton, overrides, sample(positions))
     points = part_positions(body_map, positions, quats, motion.skeleton)
     model_rest = {part: p[0] for part, p in model_points(model, model.rest_qpos()[None]).items()}
-    neutral, stance = neutral_stance(motion, body_map, quats, points)
-    orientations = _orientations(motion, body_map, model, model_rest, quats, points, neutral)
-    start = _read_hinges(model, orientations, limits)
-    scaled, scale = _scale(points, stance, orientations, model_rest)
+    stance = neutral_stance(motion, body_map, quats, points)
+    orientations = _orientations(motion, body_map, model, model_rest, quats, points, stance)
+    start = read_angles(model, orientations, limits)
+    scaled, scale = scaled_positions(points, stance.points, orientations, model_rest)
     start[:, :3] = scaled["hips"]
-    targets = _targets(model, scaled, orientations)
+    targets = ik_targets(model, scaled, orientations)
     qpos = solve_in_time(model, start, targets, limits)
     qpos[:, 3:7] = rot.continuous(qpos[:, 3:7])
     out = Motion(model, qpos, motion.fps, motion.name, meta=dict(motion.meta))
@@ -148,37 +118,29 @@ def _orientations(
     model_rest: dict[str, Array],
     quats: Array,
     points: dict[str, Array],
-    neutral: Array,
+    stance: Stance,
 ) -> dict[str, Array]:
     """World quaternions ``[T, 4]`` for the model's joints, carried over from the source's."""
     parts, out = body_map.parts, {}
 
     def carried(joint: int, constant: Array | None = None) -> Array:
-        return rot.multiply(quats[:, joint], (rot.conjugate(neutral[joint]) if constant is None else constant)[None])
+        to_model = rot.conjugate(stance.orientations[joint]) if constant is None else constant
+        return rot.multiply(quats[:, joint], to_model[None])
 
     for part in ("hips", "neck", "head", "left_clavicle", "right_clavicle"):
         if part in parts:
             out[MODEL_PARTS[part]] = carried(parts[part])
+    limbs = [_limb(model, model_rest, body_map, quats, points, s, p) for s in SIDES for p in _LIMBS]
+    axes = hinge_axes(limbs, stance)
+    for limb in limbs:
+        for k, (part, joint) in enumerate(zip(limb.parts, limb.joints, strict=True)):
+            along = bone_direction(limb.quats[k], limb.bones[k])
+            out[MODEL_PARTS[part]] = carried(joint, align((along, axes[part]), (limb.rest[k], limb.hinge)))
+    feet = {s: _foot(model, model_rest, parts, quats, points, out, s) for s in SIDES if f"{s}_toe" in points}
+    size = _leg_length(points) / _ADULT_LEGS
+    constants = foot_constants(feet, stance, uprightness(points), size, motion.fps)
     for side in SIDES:
-        for chain in (("thigh", "shin", "foot"), ("arm", "forearm", "hand")):
-            out.update(
-                _limb_orientations(model, model_rest, body_map, quats, points, [f"{side}_{p}" for p in chain], carried)
-            )
-        foot, toe = f"{side}_foot", f"{side}_toe"
-        constant = None
-        if toe in points:
-            direction = bone_direction(quats[:, parts[foot]], points[toe] - points[foot])
-            normal = floor_normal(quats[:, parts[foot]], points[foot], points[toe], motion.fps)
-            model_toe = model_rest[toe] - model_rest[foot]
-            if abs(angle_between(normal, direction) - angle_between(_UP, model_toe)) < _FLAT_FOOT:
-                constant = align((normal, direction), (_UP, model_toe))
-            else:
-                # A dancer on the tips of the toes never shows the floor's normal: then the ankle's mean turn against
-                # the knee's axis is taken for none.
-                knee = np.array(model.joints[model.index(MODEL_PARTS[f"{side}_shin"])].dofs[0].axis)
-                across = bone_direction(quats[:, parts[foot]], rot.rotate(out[MODEL_PARTS[f"{side}_shin"]], knee[None]))
-                constant = align((direction, across), (model_toe, knee))
-        out[MODEL_PARTS[foot]] = carried(parts[foot], constant)
+        out[MODEL_PARTS[f"{side}_foot"]] = carried(parts[f"{side}_foot"], constants.get(side))
         # A hand's neutral is its mean against the forearm; nothing measures the palm's side in most rigs.
         forearm, hand = out[MODEL_PARTS[f"{side}_forearm"]], quats[:, parts[f"{side}_hand"]]
         out[MODEL_PARTS[f"{side}_hand"]] = rot.multiply(
@@ -192,29 +154,62 @@ def _orientations(
     return out
 
 
-def _limb_orientations(
+_LIMBS = (("thigh", "shin", "foot"), ("arm", "forearm", "hand"))
+
+
+def _limb(
     model: Skeleton,
     model_rest: dict[str, Array],
     body_map: BodyMap,
     quats: Array,
     points: dict[str, Array],
-    chain: list[str],
-    carried: Callable[..., Array],
-) -> dict[str, Array]:
-    """Orientations of a limb's two long bones from bone direction and bend axis; the neutral pose if it never bends."""
-    upper, lower, end = chain
-    bones = {upper: points[lower] - points[upper], lower: points[end] - points[lower]}
-    rest = {upper: model_rest[lower] - model_rest[upper], lower: model_rest[end] - model_rest[lower]}
-    hinge = np.array(model.joints[model.index(MODEL_PARTS[lower])].dofs[0].axis)
-    out = {}
-    for part in (upper, lower):
-        frame = quats[:, body_map.parts[part]]
-        axis, evidence = bend_axis(frame, bones[upper], bones[lower])
-        constant = None
-        if evidence > _BEND_EVIDENCE:
-            constant = align((bone_direction(frame, bones[part]), axis), (rest[part], hinge))
-        out[MODEL_PARTS[part]] = carried(body_map.parts[part], constant)
-    return out
+    side: str,
+    names: tuple[str, str, str],
+) -> Limb:
+    upper, lower, end = (f"{side}_{name}" for name in names)
+    joints = (body_map.frame(upper), body_map.frame(lower))
+    toe = points.get(f"{side}_toe") if names[2] == "foot" else None
+    return Limb(
+        parts=(upper, lower),
+        joints=joints,
+        quats=quats[:, joints].swapaxes(0, 1),
+        bones=np.stack([points[lower] - points[upper], points[end] - points[lower]]),
+        rest=np.stack([model_rest[lower] - model_rest[upper], model_rest[end] - model_rest[lower]]),
+        hinge=_hinge(model, lower),
+        toe=None if toe is None else toe - points[end],
+    )
+
+
+def _foot(
+    model: Skeleton,
+    model_rest: dict[str, Array],
+    parts: dict[str, int],
+    quats: Array,
+    points: dict[str, Array],
+    orientations: dict[str, Array],
+    side: str,
+) -> Foot:
+    knee = _hinge(model, f"{side}_shin")
+    return Foot(
+        joint=parts[f"{side}_foot"],
+        quats=quats[:, parts[f"{side}_foot"]],
+        ankle=points[f"{side}_foot"],
+        toe=points[f"{side}_toe"],
+        across=rot.rotate(orientations[MODEL_PARTS[f"{side}_shin"]], knee[None]),
+        model_toe=model_rest[f"{side}_toe"] - model_rest[f"{side}_foot"],
+        model_across=knee,
+    )
+
+
+def _hinge(model: Skeleton, part: str) -> Array:
+    """The axis ``[3]`` of a model's knee or elbow."""
+    return np.array(model.joints[model.index(MODEL_PARTS[part])].dofs[0].axis)
+
+
+def _leg_length(points: dict[str, Array]) -> float:
+    """Hip to ankle along the bones, m: medians over the clip, mean of both sides."""
+    bones = [(f"{s}_{a}", f"{s}_{b}") for s in SIDES for a, b in (("thigh", "shin"), ("shin", "foot"))]
+    return sum(float(np.median(np.linalg.norm(points[a] - points[b], axis=1))) for a, b in bones) / 2
 
 
 def _spine_slots(body_map: BodyMap) -> dict[int, int]:
@@ -235,126 +230,6 @@ def _spread_spine(out: dict[str, Array], known: dict[int, Array]) -> None:
         out[name] = rot.multiply(chain[below], rot.from_rotvec(part * (k - below) / (above - below)))
 
 
-def _read_hinges(model: Skeleton, orientations: dict[str, Array], limits: Array) -> Array:
-    """``[T, nq]`` from world orientations: three hinges by Euler angles, one by its twist about the axis."""
-    frames = len(orientations["Hips"])
-    qpos = np.zeros((frames, model.nq))
-    qpos[:, 3:7] = orientations["Hips"]
-    quats: list[Array] = [orientations["Hips"]]
-    for j, joint in enumerate(model.joints[1:], start=1):
-        parent = quats[joint.parent]
-        local = rot.multiply(rot.conjugate(parent), orientations[joint.name])
-        axes = np.array([d.axis for d in joint.dofs])
-        columns = slice(7 + model.dof_slices[j].start, 7 + model.dof_slices[j].stop)
-        if len(axes) == 1:
-            along = np.sum(local[:, 1:] * axes[0], axis=1)
-            angles = 2.0 * np.arctan2(along, local[:, 0])[:, None]
-        else:
-            angles = Rotation.as_davenport(rot.to_scipy(local), axes, "intrinsic")
-        low, high = limits[model.dof_slices[j], 0], limits[model.dof_slices[j], 1]
-        qpos[:, columns] = np.clip(_within(angles, axes, low, high), low, high)
-        reached = np.broadcast_to(np.array([1.0, 0, 0, 0]), (frames, 4))
-        for k, axis in enumerate(axes):
-            reached = rot.multiply(reached, rot.from_axis_angle(axis, qpos[:, columns.start + k]))
-        quats.append(rot.multiply(parent, reached))
-    return qpos
-
-
-def _within(angles: Array, axes: Array, low: Array, high: Array) -> Array:
-    """The equal set of angles ``[T, d]`` about ``axes [d, 3]`` that fits the limits best.
-
-    Three hinges reach every orientation twice, (a, b, c) and (a + pi, 2 lock - b, c + pi), where ``lock`` is the middle
-    angle that lays the third axis along the first; and each angle may be moved by a whole turn.
-    """
-    centre = (low + high) / 2
-    ways = [angles]
-    if len(axes) == 3:
-        lock = np.arctan2(np.dot(np.cross(axes[2], axes[0]), axes[1]), np.dot(axes[2], axes[0]))
-        ways.append(angles * [1, -1, 1] + [np.pi, 2 * lock, np.pi])
-    ways = [w - 2 * np.pi * np.round((w - centre) / (2 * np.pi)) for w in ways]
-    # Outside the limits costs most; inside, the nearer the middle the better, which keeps time smooth.
-    cost = [np.sum((w - np.clip(w, low, high)) ** 2 + 0.01 * (w - centre) ** 2, axis=1) for w in ways]
-    return np.take_along_axis(np.stack(ways), np.argmin(cost, axis=0)[None, :, None], axis=0)[0]
-
-
-def model_points(model: Skeleton, qpos: Array) -> dict[str, Array]:
-    """The model's position ``[T, 3]`` of every part (toe and crown: tips)."""
-    positions, quats = forward_kinematics(model, qpos)
-    points = {part: positions[:, model.index(name)] for part, name in MODEL_PARTS.items()}
-    for part, (joint, tip) in _tips(model).items():
-        points[part] = positions[:, joint] + rot.rotate(quats[:, joint], tip[None])
-    return points
-
-
-def _tips(model: Skeleton) -> dict[str, tuple[int, Array]]:
-    joints = {f"{side}_toe": model.index(f"{side.capitalize()}Foot") for side in SIDES} | {"crown": model.index("Head")}
-    return {part: (j, np.array(model.joints[j].tips[0])) for part, j in joints.items()}
-
-
-def _scale(
-    points: dict[str, Array], stance: dict[str, Array], orientations: dict[str, Array], model_rest: dict[str, Array]
-) -> tuple[dict[str, Array], float]:
-    """Source positions with every link stretched to the model's length, measured from the middle of the hip joints.
-
-    Limbs keep the source's directions. Inside the trunk rigs place joints differently (a root above the hips, a neck
-    ahead of the spine): those links are first turned by what sets the source's neutral stance apart from the model's.
-    """
-
-    def with_centre(p: dict[str, Array]) -> dict[str, Array]:
-        return p | {"centre": (p["left_thigh"] + p["right_thigh"]) / 2}
-
-    points, stance, model_rest = with_centre(points), with_centre(stance), with_centre(model_rest)
-
-    def length(part: str, above: str) -> float:
-        return float(np.median(np.linalg.norm(points[part] - points[above], axis=1)))
-
-    legs = [(f"{s}_{a}", f"{s}_{b}") for s in SIDES for a, b in (("shin", "thigh"), ("foot", "shin"))]
-    scale = sum(float(np.linalg.norm(model_rest[a] - model_rest[b])) for a, b in legs) / sum(
-        length(a, b) for a, b in legs
-    )
-    scaled = {"centre": points["centre"] * scale}
-    for part, above in _LINKS.items():
-        if part not in points or above not in scaled or length(part, above) < 0.02:
-            continue
-        link, model_link = points[part] - points[above], model_rest[part] - model_rest[above]
-        frame = _TRUNK_LINKS.get(part)
-        if frame is not None:
-            bias = rot.between(stance[part] - stance[above], model_link)
-            local = rot.rotate(rot.conjugate(orientations[frame]), link)
-            link = rot.rotate(orientations[frame], rot.rotate(bias[None], local))
-        scaled[part] = scaled[above] + link * np.linalg.norm(model_link) / length(part, above)
-    hips = model_rest["hips"] - model_rest["centre"]
-    scaled["hips"] = scaled.pop("centre") + rot.rotate(orientations["Hips"], hips[None])
-    return scaled, scale
-
-
-def _targets(model: Skeleton, scaled: dict[str, Array], orientations: dict[str, Array]) -> Targets:
-    tips = _tips(model)
-    joint, offset, position, weight = [], [], [], []
-    for part, target in scaled.items():
-        index, tip = tips.get(part) or (model.index(MODEL_PARTS[part]), np.zeros(3))
-        joint.append(index)
-        offset.append(tip)
-        position.append(target)
-        # The trunk is only as stiff as its joints allow; limbs and above all feet must arrive.
-        weight.append({"foot": 2.0, "toe": 1.0, "neck": 0.5, "head": 0.5, "arm": 0.5}.get(part.split("_")[-1], 1.0))
-    # Metres a radian: orientation decides only what positions leave open.
-    frame_weight = {"Hips": 0.2, "Head": 0.1, "RightHand": 0.05, "LeftHand": 0.05, "RightFoot": 0.05, "LeftFoot": 0.05}
-    spine = dict.fromkeys((*MODEL_SPINE, "Neck", "RightShoulder", "LeftShoulder", "RightArm", "LeftArm"), 0.02)
-    thighs = dict.fromkeys(("RightUpLeg", "LeftUpLeg"), 0.01)
-    weights = frame_weight | spine | thighs
-    names = [n for n in weights if n in orientations]
-    return Targets(
-        np.array(joint),
-        np.array(offset),
-        np.stack(position, axis=1),
-        np.array(weight),
-        np.array([model.index(n) for n in names]),
-        np.stack([orientations[n] for n in names], axis=1),
-        np.array([weights[n] for n in names]),
-    )
-
-
 def _report(
     model: Skeleton,
     qpos: Array,
@@ -366,10 +241,11 @@ def _report(
 ) -> RetargetReport:
     _, quats = forward_kinematics(model, qpos)
     reached = model_points(model, qpos)
-    mm, degrees = {}, {}
+    mm, degrees, worst = {}, {}, {}
     for part, target in scaled.items():
         distance = 1000 * np.linalg.norm(reached[part] - target, axis=1)
         mm[part] = (float(distance.mean()), float(distance.max()))
+        worst[part] = int(distance.argmax())
     for part, name in MODEL_PARTS.items():
         if part in body_map.parts:
             off = rot.multiply(rot.conjugate(orientations[name]), quats[:, model.index(name)])
@@ -379,4 +255,4 @@ def _report(
     stuck = ((joints <= limits[:, 0] + 1e-6) | (joints >= limits[:, 1] - 1e-6)).mean(axis=0)
     names = [f"{j.name}_{k}" for j in model.joints for k in range(len(j.dofs))]
     at_limit = {n: float(s) for n, s in zip(names, stuck, strict=True) if s > 0}
-    return RetargetReport(mm, degrees, at_limit, body_map.unmapped, scale)
+    return RetargetReport(mm, degrees, at_limit, body_map.unmapped, scale, worst_frame=worst)

@@ -67,10 +67,12 @@ def base_clips(
     for path in files:
         motion = read_motion(path)
         try:
-            clip, _ = reference_motion(motion, humanoid, settings)
+            clip, report = reference_motion(motion, humanoid, settings)
         except ValueError as error:
             cause = error.cause if isinstance(error, InputError) else str(error)
             raise InputError(path, "motion", cause) from None
+        for line in report.warnings:
+            print(f"warning: {path.name}: {line}", file=sys.stderr)
         if len(clip) >= least_frames:
             out[path.name] = clip.qpos
     if not out:

@@ -7,17 +7,18 @@ import sys
 from collections.abc import Sequence
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from egopose.core.config import compose_config
 from egopose.core.errors import InputError
 from egopose.motion.io import given_options
 from egopose.motion.notes import tell_notes
+from egopose.motion.plausibility import source_findings, tell
+from egopose.viewer.app import Viewer
+from egopose.viewer.auth_proxy import Address
+from egopose.viewer.clip import Footage
+from egopose.viewer.clip_sources import read_runs
+from egopose.viewer.live import LiveViewer
 from egopose.vision.video import probe_video
-
-if TYPE_CHECKING:
-    from egopose.viewer.app import Viewer
-    from egopose.viewer.live import LiveViewer
 
 _LIVE = ("ws://", "wss://")
 
@@ -44,11 +45,6 @@ def open_viewer(
     """
     if find_spec("viser") is None:
         raise InputError("view", "viser", "is not installed; pip install 'egopose[view]'")
-    from egopose.viewer.app import Viewer
-    from egopose.viewer.auth_proxy import Address
-    from egopose.viewer.clip import Footage
-    from egopose.viewer.clip_sources import read_runs
-    from egopose.viewer.live import LiveViewer
 
     overrides = [word for word in words if "=" in word and not is_source(word)]
     sources = [word for word in words if word not in overrides]
@@ -64,7 +60,9 @@ def open_viewer(
         probe_video(footage.path)
     reader = compose_config("sync", ["video=-", "motion=-", *overrides])["reader"]
     runs = read_runs(sources, footage, given_options(reader))
-    for run in runs:
+    for source, run in zip(sources, runs, strict=True):
         for name, clip in run.clips.items():
+            if Path(source).is_file():
+                tell(source_findings(clip.motion), name, lambda line: print(line, file=sys.stderr))
             tell_notes(name, clip.motion, lambda line: print(line, file=sys.stderr))
     return Viewer(runs, place, offset is None, overrides)

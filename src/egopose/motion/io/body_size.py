@@ -10,6 +10,7 @@ import re
 
 import numpy as np
 
+from egopose.motion.io.up_axis import settle_up
 from egopose.motion.joint_names import plain_names
 from egopose.motion.kinematics import forward_kinematics
 from egopose.motion.rotations import Array
@@ -43,7 +44,8 @@ def stature(skeleton: Skeleton, positions: Array) -> float:
 def guess_up(skeleton: Skeleton, qpos: Array) -> str:
     """The axis the head is above the feet along, on average over frames; y where the names do not say.
 
-    A body that mostly lies or crawls points nowhere: y, BVH's custom, is kept unless another axis clearly wins.
+    A body that mostly lies or crawls points nowhere: y, BVH's custom, is kept unless another axis clearly wins. Where
+    the rest pose stands along another axis, :func:`egopose.motion.io.up_axis.settle_up` chooses.
     """
     heads, feet = named(skeleton, "head"), named(skeleton, "foot")
     if not heads or not feet:
@@ -51,9 +53,12 @@ def guess_up(skeleton: Skeleton, qpos: Array) -> str:
     positions, _ = forward_kinematics(skeleton, qpos)
     toward_head = (positions[:, heads[0]] - positions[:, feet].mean(axis=1)).mean(axis=0)
     axis = int(np.argmax(np.abs(toward_head)))
-    if abs(toward_head[axis]) < max(2.0 * toward_head[1], 0.35 * stature(skeleton, positions)):
-        return "y"
-    return ("-" if toward_head[axis] < 0 else "") + "xyz"[axis]
+    height = stature(skeleton, positions)
+    if abs(toward_head[axis]) < max(2.0 * toward_head[1], 0.35 * height):
+        posed = "y"
+    else:
+        posed = ("-" if toward_head[axis] < 0 else "") + "xyz"[axis]
+    return settle_up(skeleton, qpos, heads[0], feet, height, posed)
 
 
 _PATTERNS = {"head": ("head", "neck"), "foot": ("foot|ankle", "toe", "leg|shin|calf|knee")}
