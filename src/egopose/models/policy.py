@@ -33,9 +33,9 @@ _ACTIVATIONS: dict[str, type[nn.Module]] = {"relu": nn.ReLU, "tanh": nn.Tanh, "e
 
 @dataclass(frozen=True)
 class ContextSettings:
-    """``source``: ``frozen`` (``visual_context`` is in the observation), ``trainable`` (own BiLSTM over the episode) or
-    ``past`` (own LSTM over the ``horizon`` frames up to the episode's first); units and frames are not read by
-    ``frozen``, ``padding`` by ``trainable`` only."""
+    """``source``: ``frozen`` (``visual_context`` is in the observation), ``trainable`` (own BiLSTM over the episode),
+    ``past`` (own LSTM over the ``horizon`` frames up to the episode's first) or ``none`` (nothing is seen); units and
+    frames are not read by ``frozen`` and ``none``, ``padding`` by ``trainable`` only."""
 
     source: str
     hidden_size: int
@@ -102,9 +102,9 @@ class PolicySettings:
             if config.get(name) is not None
         }
         settings = from_mapping(cls, {**config, **parts}, "model")
-        if settings.context.source not in ("frozen", "trainable", "past"):
+        if settings.context.source not in ("frozen", "trainable", "past", "none"):
             raise InputError(
-                "model", "context.source", f"must be frozen, trainable or past, not {settings.context.source!r}"
+                "model", "context.source", f"must be frozen, trainable, past or none, not {settings.context.source!r}"
             )
         if settings.activation not in _ACTIVATIONS:
             raise InputError("model", "activation", f"must be one of {', '.join(_ACTIVATIONS)}")
@@ -182,7 +182,7 @@ def build_actor(
     context, context_key, context_width = _context(settings, widths, "visual_context", features_table, take_bounds)
     memory, state_key, state_width = _memory(settings, widths, state_key, "policy")
     width = state_width + context_width + sum(_width(widths, key, "inputs") for key in settings.inputs)
-    in_keys = [state_key, context_key, *settings.inputs]
+    in_keys = [state_key, *context_key, *settings.inputs]
     feedback = None if settings.feedback is None else BalanceFeedback(settings.feedback, dof_names)
     at = in_keys.index("tracking_error") if feedback is not None else 0
     head = GaussianHead(width, action_size, settings, feedback, at)
@@ -221,7 +221,7 @@ def build_critic(
     )
     memory, state_key, state_width = _memory(settings, widths, state_key, "value")
     privileged = (*settings.inputs, *settings.critic.privileged)
-    in_keys = [state_key, context_key, *privileged]
+    in_keys = [state_key, *context_key, *privileged]
     width = state_width + context_width
     width += sum(_width(widths, key, "critic.privileged") for key in privileged)
     value = ValueOperator(_mlp(width, 1, settings.critic.hidden, settings.activation), in_keys=in_keys)
@@ -236,20 +236,22 @@ def _context(
     out_key: str,
     features_table: Tensor | None,
     take_bounds: Tensor | None,
-) -> tuple[list[TensorDictModule], str, int]:
-    """Modules that make the context (none where it is frozen), the key it stands under, its width."""
+) -> tuple[list[TensorDictModule], list[str], int]:
+    """Modules that make the context (none where it is frozen), the key it stands under, if any, its width."""
+    if settings.context.source == "none":
+        return [], [], 0
     if settings.context.source == "frozen":
-        return [], "visual_context", _width(widths, "visual_context", "context.source")
+        return [], ["visual_context"], _width(widths, "visual_context", "context.source")
     if features_table is None or take_bounds is None:
         cause = f"{settings.context.source} needs the store's visual features and take bounds"
         raise InputError("model", "context.source", cause)
     if settings.context.source == "past":
         past = ForwardContext(features_table.shape[1], settings.context.hidden_size)
         seen = PastContext(features_table, past, take_bounds, settings.context.horizon)
-        return [past_context_module(seen, out_key)], out_key, past.output_size
+        return [past_context_module(seen, out_key)], [out_key], past.output_size
     network = BidirectionalContext(features_table.shape[1], settings.context.hidden_size)
     window = EpisodeContext(features_table, network, take_bounds, settings.context.padding, settings.context.horizon)
-    return [episode_context_module(window, out_key)], out_key, network.output_size
+    return [episode_context_module(window, out_key)], [out_key], network.output_size
 
 
 def _memory(
