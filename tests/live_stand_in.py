@@ -12,6 +12,7 @@ from env_stand_in import group
 
 from egopose.benchmarks.stream import untrained_on
 from egopose.data.preparation import humanoid_of
+from egopose.humanoid.state_layout import StateLayout
 from egopose.inference.stream.build import Trained
 from egopose.vision.video import write_video
 
@@ -36,7 +37,7 @@ def untrained(model: str = "fast", task: str = "residual", cross_fit: int = 1, s
     torch.manual_seed(0)
     humanoid = humanoid_of(config)
     # Around standing, with so much spread that what is seen makes a difference.
-    states = 0.3 * torch.randn(300, 2 * humanoid.mj_model.nq - 3)
+    states = 0.3 * torch.randn(300, StateLayout(humanoid.mj_model.nu).size)
     states[:, 0], states[:, 1] = 0.95, 1.0
     return untrained_on(config, humanoid, states)
 

@@ -27,6 +27,7 @@ from egopose.data.store import TakeStore
 from egopose.envs.mdp.observations import humanoid_state
 from egopose.evaluation.metrics import pose_error
 from egopose.humanoid.model import HumanoidModel
+from egopose.humanoid.state_layout import StateLayout
 from egopose.models.blended import MeanOfKernels
 from egopose.models.mirror import state_mirror
 from egopose.models.regressor import state_statistics
@@ -154,8 +155,9 @@ def _frames(spans: list[Span]) -> Tensor:
 
 def _as_qpos(states: Tensor, humanoid: HumanoidModel) -> Array:
     """States z ``[T, S]`` as coordinates ``[T, nq]`` of a body that stands over the origin."""
-    poses = states[:, : 5 + len(humanoid.joint_range)].double().numpy()
-    return np.concatenate([np.zeros((len(poses), 2)), poses], axis=1)
+    layout = StateLayout.of_size(states.shape[1])
+    poses = [states[:, part].double().numpy() for part in (layout.root_pose, layout.joint_angles)]
+    return np.concatenate([np.zeros((len(states), 2)), *poses], axis=1)
 
 
 def main() -> None:

@@ -26,6 +26,7 @@ from egopose.evaluation.forecast_run import run_forecast_evaluation
 from egopose.evaluation.reports import evaluation_report
 from egopose.humanoid.config import HumanoidConfig, SimConfig
 from egopose.humanoid.model import build_humanoid
+from egopose.humanoid.state_layout import StateLayout
 from egopose.inference.context_states import context_states
 from egopose.inference.forecast_contexts import _states, context_dataset, past_states
 from egopose.inference.outputs import TakeVideo
@@ -211,12 +212,12 @@ def test_true_contexts_are_the_references_states(agent: Agent) -> None:
 
 def test_where_the_fail_safe_moved_the_body_its_velocity_is_the_regressors(agent: Agent) -> None:
     qpos = agent.dataset.reference["qpos"][:6].numpy()
-    dofs = qpos.shape[1] - 7
-    regressed = torch.full((6, 11 + 2 * dofs), 7.0, dtype=torch.float64)
+    layout = StateLayout(qpos.shape[1] - 7)
+    regressed = torch.full((6, layout.size), 7.0, dtype=torch.float64)
     plain = _states(qpos, np.zeros(6, dtype=bool), regressed, 30.0)
     states = _states(qpos, np.array([0, 0, 1, 0, 0, 1], dtype=bool), regressed, 30.0)
-    assert (states[[1, 4, 5], 5 + dofs :] == 7.0).all()
-    assert torch.equal(states[:, : 5 + dofs], plain[:, : 5 + dofs])
+    assert (states[[1, 4, 5], layout.velocities] == 7.0).all()
+    assert torch.equal(*(each[:, : layout.joint_angles.stop] for each in (states, plain)))
     assert torch.equal(states[[0, 2, 3]], plain[[0, 2, 3]])
 
 

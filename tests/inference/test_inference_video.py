@@ -18,6 +18,7 @@ from egopose.core.errors import InputError
 from egopose.data.spans import Span
 from egopose.humanoid.config import HumanoidConfig, SimConfig
 from egopose.humanoid.model import build_humanoid
+from egopose.humanoid.state_layout import StateLayout
 from egopose.inference.video import estimate_video
 from egopose.inference.video_regression import seen_in, video_dataset
 from egopose.models.regressor_settings import RegressorSettings
@@ -54,7 +55,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     }
     torch.manual_seed(0)
     humanoid = build_humanoid(HumanoidConfig.from_mapping(config["humanoid"]), SimConfig(substeps=5))
-    standing = torch.zeros(300, 2 * humanoid.mj_model.nq - 3)
+    standing = torch.zeros(300, StateLayout(humanoid.mj_model.nu).size)
     standing[:, 0], standing[:, 1] = 0.95, 1.0
     encoder = build_encoder(config["vision"]["encoder"])
     trained_as = from_mapping(RegressorSettings, config["regressor"], "conf/regressor")

@@ -27,6 +27,7 @@ from egopose.envs.reference_forecasts import ReferenceForecasts
 from egopose.envs.test_time import prepare_for_test
 from egopose.evaluation import forecast_run as forecast_evaluation
 from egopose.evaluation.forecast_run import ForecastSettings, forecast_windows_of
+from egopose.humanoid.state_layout import StateLayout
 from egopose.inference.forecaster import forecast
 from egopose.inference.planner import Planner
 from egopose.inference.planner_settings import PlannerSettings
@@ -140,11 +141,12 @@ def test_the_body_that_is_followed_is_the_curves_at_that_step(agent: Agent) -> N
         states = futures.states(start, torch.full_like(start, step))
         close = partial(torch.testing.assert_close, atol=1e-4, rtol=1e-4, check_dtype=False)
         close(followed.root_height, states[:, 0])
-        told_facing, facing = followed.root_rotation, states[:, 1:5] / states[:, 1:5].norm(dim=-1, keepdim=True)
+        layout = StateLayout.of_size(states.shape[1])
+        rotation = states[:, layout.root_rotation]
+        told_facing, facing = followed.root_rotation, rotation / rotation.norm(dim=-1, keepdim=True)
         close((told_facing * facing).sum(-1).abs(), torch.ones(len(start)))
-        size = futures.coefficients.shape[-1]
-        close(followed.root_linear_velocity, states[:, size - 6 : size - 3])
-        close(followed.root_angular_velocity.norm(dim=-1), states[:, size - 3 : size].norm(dim=-1))
+        close(followed.root_linear_velocity, states[:, layout.root_linear_velocity])
+        close(followed.root_angular_velocity.norm(dim=-1), states[:, layout.root_angular_velocity].norm(dim=-1))
 
 
 def test_the_head_that_is_followed_is_as_high_as_the_curves(agent: Agent) -> None:

@@ -24,6 +24,7 @@ from egopose.core.config import compose_config
 from egopose.core.errors import InputError
 from egopose.core.torch_settings import torch_threads
 from egopose.envs.reference_forecasts import TrackForecast
+from egopose.humanoid.state_layout import StateLayout
 from egopose.inference.context_states import context_states
 from egopose.inference.forecaster import forecast
 from egopose.inference.stream import messages
@@ -285,7 +286,7 @@ def forecasting_run(trained: Trained, tmp_path_factory: pytest.TempPathFactory) 
     folder = tmp_path_factory.mktemp("forecasting")
     small = ["collector.num_envs=2", "algo.steps_per_iteration=16", "algo.minibatch_size=16", "logger=csv"]
     config = compose_config("train", ["experiment=forecasting", *small])
-    size = 2 * trained.humanoid.mj_model.nq - 3
+    size = StateLayout(trained.humanoid.mj_model.nu).size
     weights = {"regressor": trained.regressor, "config": {"state_size": size, **config}}
     RunCheckpoint(weights).save(folder / "regressor", metadata=metadata_of("regressor", size, 1, 0, 0.0))
     dataset = still_frames(trained.humanoid, trained.regressor, trained.source_config, 70)
@@ -301,11 +302,11 @@ def following_run(trained: Trained, tmp_path_factory: pytest.TempPathFactory) ->
     folder = tmp_path_factory.mktemp("following")
     small = ["collector.num_envs=2", "algo.steps_per_iteration=16", "algo.minibatch_size=16", "logger=csv"]
     config = compose_config("train", ["experiment=forecasting_follow", "regressor=fast", *small])
-    size = 2 * trained.humanoid.mj_model.nq - 3
+    size = StateLayout(trained.humanoid.mj_model.nu).size
     weights = {"regressor": trained.regressor, "config": {"state_size": size, **config}}
     RunCheckpoint(weights).save(folder / "regressor", metadata=metadata_of("regressor", size, 1, 0, 0.0))
     values = {key: value for key, value in config["forecaster"].items() if key != "optimiser"}
-    settings, pose = ForecasterSettings.from_config(values), 11 + trained.humanoid.mj_model.nu
+    settings, pose = ForecasterSettings.from_config(values), StateLayout(trained.humanoid.mj_model.nu).pose_size
     parts = [build_forecaster(settings, torch.zeros(pose), torch.ones(pose), 30.0, k) for k in range(settings.members)]
     blank = blank_kernel_forecaster(settings, torch.zeros(pose), torch.ones(pose), 30.0, 4)
     blank.kept.fill_(0.4)

@@ -19,6 +19,7 @@ from egopose.data.preparation import flow_name, humanoid_of, prepare
 from egopose.data.spans import Span, group_blocks, without_block
 from egopose.data.store import TakeStore
 from egopose.envs.mdp.observations import humanoid_state
+from egopose.humanoid.state_layout import StateLayout
 from egopose.inference.causal import CausalRegression
 from egopose.inference.video_regression import seen_in
 from egopose.models.blended import TimeWindows, blended_regressor, flow_cells
@@ -168,7 +169,7 @@ def test_share_groups_cover_the_state_once_and_judge_no_hand() -> None:
     members = torch.cat([columns for columns, _, _ in groups.values()])
     assert sorted(members.tolist()) == list(range(115))
     judged = torch.cat([columns for _, columns, _ in groups.values()]).tolist()
-    assert not {5 + d for d in humanoid.hand_dofs.tolist()} & set(judged)
+    assert not {StateLayout(52).joint_angles.start + d for d in humanoid.hand_dofs.tolist()} & set(judged)
     assert len(groups["legs"][0]) == 2 * 14
 
 
@@ -226,7 +227,7 @@ def test_a_store_makes_keeps_and_reads_back_a_blended_regressor(folder: Path, mo
     wanted = model.normalise(humanoid_state(store.reference))
     block = [Span(s.start, s.start + (s.stop - s.start) // 2) for s in half]
     importance = torch.zeros(115)
-    importance[[5 + dof for dof in range(52) if dof not in humanoid.hand_dofs]] = 1.0
+    importance[StateLayout(52).joint_angles][[d for d in range(52) if d not in humanoid.hand_dofs]] = 1.0
     importance *= model.state_std
     (kernel,) = fit_kernels(table, wanted, without_block(half, block, 2, 2), kernel_settings, importance, None)
     by_network = model.normalise(regressor_tables(network, store, humanoid, flow)[0]["humanoid_state"])

@@ -30,6 +30,7 @@ from egopose.data.spans import Span, cross_fit_blocks
 from egopose.data.splits import split_takes
 from egopose.data.store import TakeStore
 from egopose.envs.mdp.observations import humanoid_state
+from egopose.humanoid.state_layout import StateLayout
 from egopose.inference.context_states import context_states
 from egopose.models.kernel_regression import fit_kernel_regression
 from egopose.models.mirror import StateMirror, state_mirror
@@ -200,7 +201,7 @@ def test_of_a_mirrored_context_it_forecasts_the_mirrored_motion(body: str) -> No
 
 def test_the_mirror_of_poses_is_the_one_of_states_without_the_joints_velocities() -> None:
     whole = state_mirror(stand_in().skeleton)
-    poses, size = whole.poses(), 11 + (len(whole.index) - 11) // 2
+    poses, size = whole.poses(), StateLayout.of_size(len(whole.index)).pose_size
     states = torch.randn(3, len(whole.index))
     assert torch.equal(poses.state(states[:, :size]), whole.state(states)[:, :size])
 
@@ -364,7 +365,7 @@ def test_a_run_learns_keeps_and_reads_back_networks_and_kernel(
     made = motion_forecasts._settings(config)[0]
     parts = cross_fit_starts(whole, cross_fit_blocks(whole, 2), made)
     assert [given[2] for given in asked] == [whole, *(others for others, _ in parts)]
-    size = 11 + dataset.humanoid.mj_model.nu
+    size = StateLayout(dataset.humanoid.mj_model.nu).pose_size
     assert torch.equal(asked[0][0].rows[0], noisy[:5, :size])
 
     futures = followed.futures
@@ -412,7 +413,8 @@ def test_a_run_with_one_that_goes_on_frame_by_frame_learns_keeps_ships_and_reads
     config["forecaster"]["continued"] = continued(share=0.4, until=5)
     dataset = dataset_of(config, store)
     assert dataset.states is not None
-    size, noisy = 11 + dataset.humanoid.mj_model.nu, dataset.states + 0.1 * torch.randn(dataset.states.shape)
+    size = StateLayout(dataset.humanoid.mj_model.nu).pose_size
+    noisy = dataset.states + 0.1 * torch.randn(dataset.states.shape)
     monkeypatch.setattr(
         motion_forecasts, "training_contexts",
         lambda _, __, ___, ____, starts, context: noisy[starts[:, None] + torch.arange(1 - context, 1)],
@@ -514,13 +516,13 @@ def test_a_run_from_before_there_was_a_kernel_forecasts_by_its_networks_alone(fo
     config["forecaster"] = {key: value for key, value in config["forecaster"].items() if key != "kernel"}
     dataset, made = dataset_of(config, store), motion_forecasts._settings(config)[0]
     assert made.kernel is None
-    size = 11 + dataset.humanoid.mj_model.nu
+    size = StateLayout(dataset.humanoid.mj_model.nu).pose_size
     networks = [build_forecaster(made, torch.randn(size), 1 + torch.rand(size), FPS, seed).eval() for seed in range(2)]
     table = {"coefficients": torch.zeros(1, 5, size), "starts": torch.tensor([7])}
     kept = {"members": nn.ModuleList(networks), "futures": ComponentState(lambda: table, lambda _: None)}
     RunCheckpoint(kept).save(tmp_path / FOLDER, metadata=metadata_of("motion forecaster", size, 0, 0, 0.0))
     assert [name for name in PARTS if has_component(tmp_path / FOLDER, name)] == ["members"]
-    pasts = torch.randn(3, CONTEXT, 2 * size - 11)
+    pasts = torch.randn(3, CONTEXT, StateLayout.of_pose_size(size).size)
     expected = motion_forecasts._curves(Members(networks, None, 0.0), pasts[..., :size])
     assert torch.equal(ForecastCurves(config, dataset, tmp_path)(pasts), expected)
     seen = pasts[..., :size]

@@ -28,6 +28,7 @@ from egopose.data.spans import Span, cross_fit_blocks, without_block
 from egopose.data.store import TakeStore
 from egopose.envs.mdp.observations import humanoid_state
 from egopose.humanoid.model import HumanoidModel
+from egopose.humanoid.state_layout import StateLayout
 from egopose.inference.video_regression import seen_in
 from egopose.models.blended import MeanOfKernels, TimeWindows, blended_regressor
 from egopose.models.kernel_regression import KernelRegression, fit_kernel_regression
@@ -265,7 +266,7 @@ def mirror(humanoid: HumanoidModel) -> StateMirror:
 def even_importance(mirror: StateMirror) -> Tensor:
     """Of chance for the angles, the same for a number and its image."""
     chance = torch.zeros(len(mirror.index))
-    chance[5:57] = torch.rand(52)
+    chance[StateLayout(52).joint_angles] = torch.rand(52)
     return chance + chance[mirror.index]
 
 
@@ -385,7 +386,7 @@ def test_a_store_makes_keeps_and_reads_back_mirrored_kernels_of_several_sets(
     image = (mirrored, model.normalise(state_mirror(humanoid.skeleton).state(states)))
     wanted = model.normalise(states)
     importance = torch.zeros(115)
-    importance[[5 + dof for dof in range(52) if dof not in humanoid.hand_dofs]] = 1.0
+    importance[StateLayout(52).joint_angles][[d for d in range(52) if d not in humanoid.hand_dofs]] = 1.0
     importance *= model.state_std
     network = {**config, "regressor": {k: v for k, v in config["regressor"].items() if k != "kernel"}}
     by_network = model.normalise(regressor_tables(network, store, humanoid, flow)[0]["humanoid_state"])

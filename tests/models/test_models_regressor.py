@@ -11,6 +11,7 @@ from tensordict import TensorDict
 
 from egopose.core.errors import InputError
 from egopose.envs.mdp.observations import humanoid_state
+from egopose.humanoid.state_layout import StateLayout
 from egopose.models.mirror import joint_mirror, state_mirror
 from egopose.models.pose_regression import pose_regression, split_state, state_to_qpos
 from egopose.models.regressor import StateRegressor, state_statistics
@@ -78,7 +79,7 @@ def test_placing_a_state_undoes_taking_it(seed: int) -> None:
 
 
 def test_estimated_states_are_made_valid() -> None:
-    z = np.random.default_rng(0).normal(size=(50, 11 + 2 * BODY.n_dofs))
+    z = np.random.default_rng(0).normal(size=(50, StateLayout(BODY.n_dofs).size))
     limits = np.tile([-0.5, 0.7], (BODY.n_dofs, 1))
     parts = split_state(z, limits)
     np.testing.assert_allclose(np.linalg.norm(parts.deheaded, axis=-1), 1.0)
@@ -94,8 +95,7 @@ def test_estimated_states_are_made_valid() -> None:
 def test_constant_velocity_error_drifts_as_it_must() -> None:
     motion = wild_motion(3)
     z = states(motion)
-    at = 5 + BODY.n_dofs
-    z[:, at : at + 3] += [0.3, 0.0, 0.0]
+    z[:, StateLayout(BODY.n_dofs).root_linear_velocity] += [0.3, 0.0, 0.0]
     start = motion.qpos[0]
     back = pose_regression(z, BODY, start[:2], rot.heading(start[3:7]), 30.0)
     steps = np.linalg.norm(np.diff(back.qpos[:, :2] - motion.qpos[:, :2], axis=0), axis=1)

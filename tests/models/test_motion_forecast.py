@@ -27,6 +27,7 @@ from egopose.data.windows import ForecastWindow
 from egopose.envs.mdp.observations import humanoid_state
 from egopose.envs.reference_forecasts import ReferenceForecasts
 from egopose.evaluation import metrics
+from egopose.humanoid.state_layout import StateLayout
 from egopose.inference.forecast_start import begin_forecasts
 from egopose.models.mirror import StateMirror
 from egopose.models.motion_forecast import spline_basis
@@ -74,7 +75,7 @@ def dataset() -> Dataset:
 def curves(dataset: Dataset, horizon: int = 12) -> ReferenceForecasts:
     """Curves from every frame of the first take that fit the reference from there on."""
     poses = humanoid_state(dataset.reference).float()
-    size = 11 + (poses.shape[1] - 11) // 2
+    size = StateLayout.of_size(poses.shape[1]).pose_size
     basis = spline_basis(horizon + 1, 3, FPS)[0]
     last = int(dataset.takes.lengths[0]) - 1
     starts = torch.arange(last)
@@ -88,7 +89,8 @@ def test_curves_are_looked_up_as_splines_are_evaluated(dataset: Dataset) -> None
     start, step = torch.tensor([3, 0, 7, 7]), torch.tensor([0, 5, 12, 40])
     whole = basis[step.clamp(max=12)][:, None] @ futures.coefficients[start]
     torch.testing.assert_close(futures.poses(start, step), whole[:, 0])
-    rates = (slope[step.clamp(max=12)][:, None] @ futures.coefficients[start])[:, 0, 5:-6]
+    layout = StateLayout.of_pose_size(whole.shape[-1])
+    rates = (slope[step.clamp(max=12)][:, None] @ futures.coefficients[start])[:, 0, layout.joint_angles]
     torch.testing.assert_close(futures.states(start, step), torch.cat([whole[:, 0], rates], dim=-1))
     with pytest.raises(ValueError, match="no forecast begins at frame"):
         futures.poses(torch.tensor([len(dataset.reference) - 1]), torch.tensor([0]))
@@ -182,9 +184,9 @@ def test_its_error_is_the_papers() -> None:
     seen[:, 3:7] = rot.from_rotvec(np.array([0.02, -0.03, 0.0]))
     seen[:, 7:] = [0.3, 9.0, -0.2, 0.1]
     wanted = metrics.pose_error(seen, truth, [1])[0]
-    difference = torch.zeros(15)
-    difference[0], difference[5:9], difference[-1] = 0.4, torch.tensor([0.3, 9.0, -0.2, 0.1]), 3.0
-    difference[1:5] = torch.as_tensor(seen[0, 3:7] - truth[0, 3:7])
+    difference, layout = torch.zeros(15), StateLayout(4)
+    difference[0], difference[layout.joint_angles], difference[-1] = 0.4, torch.tensor([0.3, 9.0, -0.2, 0.1]), 3.0
+    difference[layout.root_rotation] = torch.as_tensor(seen[0, 3:7] - truth[0, 3:7])
     found = (difference / made.model.std * made.judged).norm()
     assert float(found) == pytest.approx(wanted, rel=1e-3)
 
@@ -211,7 +213,8 @@ def test_the_start_policy_asks_for_the_curves_next_pose(dataset: Dataset) -> Non
     observation = critic(actor(env.reset()))
     start = observation["episode_start"].squeeze(-1)
     assert followed.futures is not None
-    following = followed.futures.poses(start, torch.ones_like(start))[:, 5:-6]
+    following = followed.futures.poses(start, torch.ones_like(start))
+    following = following[:, StateLayout.of_pose_size(following.shape[1]).joint_angles]
     rest = torch.as_tensor(dataset.humanoid.rest_action).float()
     torch.testing.assert_close(observation["loc"] + rest, following, atol=1e-6, rtol=0)
     # Episodes begin on the curve: nothing to correct.
@@ -258,7 +261,7 @@ def test_a_forecast_follows_what_its_context_shows_and_nothing_else(dataset: Dat
     now = torch.tensor([w.now for w in windows])
     first = followed.futures.poses(now, torch.zeros(2, dtype=torch.int64))
     torch.testing.assert_close(first, wanted[:, 0])
-    torch.testing.assert_close(qpos[:, 7:].float(), first[:, 5:-6])
+    torch.testing.assert_close(qpos[:, 7:].float(), first[:, StateLayout.of_pose_size(size).joint_angles])
     assert qvel.isfinite().all()
 
 

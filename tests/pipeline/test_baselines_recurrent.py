@@ -11,7 +11,8 @@ import torch
 
 from egopose.core.errors import InputError
 from egopose.data.spans import Span
-from egopose.models.baselines.recurrent import RecurrentForecaster, ground_truth_mask, pose_state_size
+from egopose.humanoid.state_layout import StateLayout
+from egopose.models.baselines.recurrent import RecurrentForecaster, ground_truth_mask
 from egopose.models.mirror import StateMirror
 from egopose.training.fitting import Fit, FitSettings, fit
 from egopose.training.recurrent_baselines import RecurrentLearner, RecurrentSettings
@@ -129,4 +130,4 @@ def test_settings_out_of_range_and_other_models_are_refused_by_name() -> None:
         FitSettings.from_config({**vars(FIT), "batch": 0})
     with pytest.raises(InputError, match="model/"):
         Fit(learner(), FIT).load(Fit(learner(replace(ERD, recurrent=8)), FIT).state())
-    assert pose_state_size(115) == 63
+    assert StateLayout.of_size(115).pose_size == 63

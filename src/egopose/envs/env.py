@@ -422,7 +422,8 @@ class EgoPoseEnv(EnvBase):
         Raises:
             ValueError: another number of worlds or another model.
         """
-        self.physics.load_state_dict({k: state_dict[f"physics.{k}"].numpy() for k in ("state", "counters")})
+        physics = {k.removeprefix("physics."): v.numpy() for k, v in state_dict.items() if k.startswith("physics.")}
+        self.physics.load_state_dict(physics)
         self._generator.set_state(state_dict["generator"])
         self._take, self._start, self._stop, self._frame = (
             state_dict[k].numpy().copy() for k in ("take", "start", "stop", "frame")

@@ -10,6 +10,7 @@ from torch import Tensor
 from torchrl.data import Composite, TensorSpec, Unbounded
 from torchrl.envs.transforms import Transform
 
+from egopose.humanoid.state_layout import StateLayout
 from egopose.models.motion_forecast import spline_basis
 from egopose.models.pose_regression import state_to_qpos
 from egopose.motion import rotations as rot
@@ -57,13 +58,14 @@ class ReferenceForecasts:
         return self._at(start, step, self._basis)
 
     def states(self, start: Tensor, step: Tensor) -> Tensor:
-        """Humanoid states z ``[N, 2 P - 11]``, float32, joint velocities those of the curve."""
+        """Humanoid states z ``[N, S]``, float32, joint velocities those of the curve."""
         poses = self.poses(start, step)
         return torch.cat([poses, self.joint_velocities(start, step)], dim=-1)
 
     def joint_velocities(self, start: Tensor, step: Tensor) -> Tensor:
         """``[N, D]`` rad/s."""
-        return self._at(start, step, self._slope, 5, -6)
+        angles = StateLayout.of_pose_size(self.coefficients.shape[-1]).joint_angles
+        return self._at(start, step, self._slope, angles)
 
     def first_state(self, start: Tensor, reference: Tensor, joint_range: Array) -> tuple[Tensor, Tensor]:
         """``qpos [N, nq]`` and ``qvel [N, nv]`` at the curves' beginnings, standing and facing as ``reference``'s."""
@@ -72,7 +74,7 @@ class ReferenceForecasts:
         placed = state_to_qpos(states, where[:, :2], rot.heading(where[:, 3:7]), joint_range)
         return torch.from_numpy(placed[0]), torch.from_numpy(placed[1])
 
-    def _at(self, start: Tensor, step: Tensor, basis: Tensor, first: int = 0, last: int | None = None) -> Tensor:
+    def _at(self, start: Tensor, step: Tensor, basis: Tensor, part: slice = slice(None)) -> Tensor:
         row = self._row[start]
         if bool((row < 0).any()):
             raise ValueError(f"no forecast begins at frame {int(start[row < 0][0])}")
@@ -80,7 +82,7 @@ class ReferenceForecasts:
         # A cubic spline has four weights at a step: the rest are zero.
         at = (weights != 0).float().argmax(dim=1).clamp(max=basis.shape[1] - 4)
         near = at[:, None] + torch.arange(4)
-        curves = self.coefficients[row[:, None], near][..., first:last]
+        curves = self.coefficients[row[:, None], near][..., part]
         return (weights.gather(1, near).unsqueeze(-1) * curves).sum(dim=1)
 
 
@@ -130,10 +132,10 @@ class TrackForecast(Transform):
             ``visual_context [N, P * steps ahead]``.
         """
         now, following = self.forecasts.states(start, step), self.forecasts.states(start, step + 1)
-        size = self.forecasts.coefficients.shape[-1]
-        angles, rates = following[..., 5 : size - 6], following[..., size:]
+        layout = StateLayout.of_size(following.shape[-1])
+        angles, rates = following[..., layout.joint_angles], following[..., layout.joint_velocities]
         targets = (angles.double() + self.lag * rates - self.rest).float()
-        later = [self.forecasts.poses(start, step + ahead) / self.scale[:size] for ahead in self.ahead]
+        later = [self.forecasts.poses(start, step + ahead) / self.scale[layout.pose] for ahead in self.ahead]
         return now, following, targets, torch.cat(later, dim=-1)
 
     def error(self, state: Tensor, now: Tensor, following: Tensor) -> Tensor:

@@ -41,7 +41,7 @@ class Arrival:
 class Worker:
     """What one thread steps worlds with, some at a time."""
 
-    def __init__(self, model: mujoco.MjModel, substeps: int, sensors: ContactSensors | None, torques: bool) -> None:
+    def __init__(self, model: mujoco.MjModel, substeps: int, sensors: ContactSensors | None) -> None:
         self._substeps, self._sensors = substeps, sensors
         self._batch = batch = Batch(without_sensors(model) if sensors is None else model, WORLDS_AT_ONCE, nthread=1)
         # A row begins with the full physics' state: MuJoCo keeps only plugins' elsewhere.
@@ -54,7 +54,6 @@ class Worker:
         self._boxes = batch.state[:, first : first + 7 * model.nmocap] if model.nmocap else None
         # A batch copies out what is bound: nothing where nobody asks.
         self._found = None if sensors is None else batch.bind("sensordata")
-        self._torques = batch.bind("qfrc_actuator") if torques else None
         self._dofs = model.jnt_dofadr[model.actuator_trnid[:, 0]]
 
     def step(self, before: Array, ctrl: Array, parts: Iterator[slice], after: Arrival) -> None:
@@ -77,15 +76,11 @@ class Worker:
 
     def _advance(self, worlds: slice, n: int, after: Arrival) -> None:
         rows = None if n == WORLDS_AT_ONCE else range(n)
-        if self._torques is None or after.torques is None:
+        if after.torques is None:
             self._batch.step(rows, self._substeps)
             return
-        # One substep a call: a batch tells of its last one only.
-        total = np.zeros((n, len(self._dofs)))
-        for _ in range(self._substeps):
-            self._batch.step(rows)
-            total += self._torques[:n, self._dofs]
-        after.torques[worlds] = total / self._substeps
+        recorded = self._batch.rollout(self._substeps, record=("qfrc_actuator",), ids=rows)["qfrc_actuator"]
+        after.torques[worlds] = recorded.mean(axis=1)[:, self._dofs]
 
 
 class Placer:

@@ -18,6 +18,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from egopose.humanoid.state_layout import StateLayout
 from egopose.models.context import LstmState
 from egopose.models.regressor import StateRegressor
 
@@ -96,7 +97,7 @@ class CausalRegression:
     def _rows(self, context: Tensor) -> Tensor:
         """``[W, S + nu + C]``: state, joint targets and what the policy reads, of contexts ``[W, C]``."""
         states = self._regressor.decode(context) * self._regressor.state_std + self._regressor.state_mean
-        angles = states[:, 5 : 5 + len(self._low)].clamp(self._low, self._high)
+        angles = states[:, StateLayout(len(self._low)).joint_angles].clamp(self._low, self._high)
         read = self._regressor.normalise(states) if self._context_of_states else context
         return torch.cat([states, angles, read], dim=-1)
 

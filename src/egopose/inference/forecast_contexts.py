@@ -22,6 +22,7 @@ from egopose.data.store import Fragment, TakeStore
 from egopose.data.windows import ForecastWindow
 from egopose.envs.mdp.observations import humanoid_state
 from egopose.envs.problem import TakeTable
+from egopose.humanoid.state_layout import StateLayout
 from egopose.inference.context_states import context_states
 from egopose.inference.estimator import estimate_takes
 from egopose.inference.failsafe import FailSafe, FailSafeSettings
@@ -106,8 +107,8 @@ def _states(qpos: Array, resets: NDArray[np.bool_], regressed: Tensor, fps: floa
     velocity = torch.from_numpy(finite_difference(qpos, fps))
     states = humanoid_state({"qpos": torch.from_numpy(qpos), "qvel": velocity})
     jumps = np.append(resets[1:], resets[-1:])  # differences go forward, and the last frame repeats the one before
-    after_angles = 5 + qpos.shape[1] - 7
-    states[jumps, after_angles:] = regressed[jumps, after_angles:]
+    velocities = StateLayout.of_size(states.shape[1]).velocities
+    states[jumps, velocities] = regressed[jumps, velocities]
     return states
 
 

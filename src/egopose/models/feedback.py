@@ -15,10 +15,10 @@ import torch
 from torch import Tensor, nn
 
 from egopose.core.errors import InputError
+from egopose.humanoid.state_layout import StateLayout
 
-#: Columns of the state z in either plane: lean (of the de-headed root quaternion), its rate, the root's speed. Counted
-#: for z = [height 1, quaternion 4, D angles, linear velocity 3, angular velocity 3, D rates].
-_PLANES = {"pitch": (3, 1, 0), "roll": (2, 0, 1)}
+#: In either plane, components of the root's rotation (the lean), angular velocity (its rate), linear velocity (speed).
+_PLANES = {"pitch": (2, 1, 0), "roll": (1, 0, 1)}
 
 
 @dataclass(frozen=True)
@@ -66,8 +66,9 @@ class BalanceFeedback(nn.Module):
                 owners.append(plane)
         if not basis:
             raise InputError("model", "feedback", "names no hinges; null is for none")
-        linear, angular = 5 + size, 8 + size
-        columns = [[q, angular + w, linear + v] for q, w, v in (_PLANES[plane] for plane in owners)]
+        layout = StateLayout(size)
+        parts = (layout.root_rotation, layout.root_angular_velocity, layout.root_linear_velocity)
+        columns = [[part.start + at for part, at in zip(parts, _PLANES[plane], strict=True)] for plane in owners]
         self.register_buffer("basis", torch.stack(basis))
         self.register_buffer("columns", torch.tensor(columns))
         self.register_buffer("spread", torch.stack(basis).repeat_interleave(3, 0), persistent=False)

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from egopose.core.errors import InputError
+from egopose.humanoid.state_layout import StateLayout
 from egopose.motion.skeleton import Skeleton
 
 _PLANE = np.array([1.0, -1.0, 1.0])
@@ -32,8 +33,8 @@ class StateMirror:
 
     def poses(self) -> StateMirror:
         """The mirror of a state's first numbers, which are its pose: all but the joints' velocities."""
-        size = 11 + (len(self.index) - 11) // 2
-        return StateMirror(self.index[:size], self.sign[:size])
+        pose = StateLayout.of_size(len(self.index)).pose
+        return StateMirror(self.index[pose], self.sign[pose])
 
     @staticmethod
     def flow(flow: Tensor) -> Tensor:
@@ -77,8 +78,10 @@ def state_mirror(skeleton: Skeleton) -> StateMirror:
         InputError: see :func:`joint_mirror`.
     """
     joints, joint_sign = joint_mirror(skeleton)
-    dofs = skeleton.n_dofs
-    index = np.concatenate([np.arange(5), 5 + joints, 5 + dofs + np.arange(6), 11 + dofs + joints])
+    layout = StateLayout(skeleton.n_dofs)
+    index = np.arange(layout.size)
+    for part in (layout.joint_angles, layout.joint_velocities):
+        index[part] = index[part][joints]
     quat = np.concatenate([[1.0], -_PLANE])
     sign = np.concatenate([[1.0], quat, joint_sign, _PLANE, -_PLANE, joint_sign])
     return StateMirror(torch.as_tensor(index), torch.as_tensor(sign, dtype=torch.float32))

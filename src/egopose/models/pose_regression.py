@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from egopose.humanoid.state_layout import StateLayout
 from egopose.motion import rotations as rot
 from egopose.motion.motion import Motion
 from egopose.motion.rotations import Array
@@ -46,15 +47,22 @@ def split_state(state: Array, joint_range: Array | None = None) -> StateParts:
         ValueError: the last axis is not ``11 + 2 D`` long.
     """
     state = np.asarray(state, dtype=np.float64)
-    dofs, odd = divmod(state.shape[-1] - 11, 2)
-    if odd or dofs < 0 or (joint_range is not None and len(joint_range) != dofs):
-        raise ValueError(f"a state has 11 + 2 x degrees of freedom, got {state.shape[-1]}")
-    height, quat, joints, linear, angular, velocities = np.split(state, np.cumsum([1, 4, dofs, 3, 3]), axis=-1)
-    quat = quat * np.array([1.0, 1.0, 1.0, 0.0])
+    layout = StateLayout.of_size(state.shape[-1])
+    if joint_range is not None and len(joint_range) != layout.dofs:
+        raise ValueError(f"a state of {layout.dofs} degrees of freedom does not fit {len(joint_range)} joint ranges")
+    joints = state[..., layout.joint_angles]
+    quat = state[..., layout.root_rotation] * np.array([1.0, 1.0, 1.0, 0.0])
     quat[..., 0] = np.maximum(quat[..., 0], 1e-9)
     if joint_range is not None:
         joints = np.clip(joints, joint_range[:, 0], joint_range[:, 1])
-    return StateParts(height, rot.normalize(quat), joints, linear, angular, velocities)
+    return StateParts(
+        root_height=state[..., layout.root_height],
+        deheaded=rot.normalize(quat),
+        joint_angles=joints,
+        linear_velocity=state[..., layout.root_linear_velocity],
+        angular_velocity=state[..., layout.root_angular_velocity],
+        joint_velocities=state[..., layout.joint_velocities],
+    )
 
 
 def state_to_qpos(

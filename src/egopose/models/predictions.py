@@ -11,6 +11,7 @@ from torch import Tensor
 
 from egopose.core.torch_settings import torch_threads
 from egopose.data.spans import Span
+from egopose.humanoid.state_layout import StateLayout
 from egopose.models.regressor import StateRegressor
 from egopose.models.regressor_settings import RegressorSettings
 
@@ -81,12 +82,9 @@ def regression_error(model: StateRegressor, predicted: Tensor, targets: Tensor) 
     """
     wanted = model.normalise(targets)
     error, spread = (model.normalise(predicted) - wanted).square(), wanted.square()
-    dofs = (targets.shape[-1] - 11) // 2
-    ends = np.cumsum([0, 5, dofs, 6, dofs])
+    layout = StateLayout.of_size(targets.shape[-1])
     out = {"mse": error.mean().item(), "mean_mse": spread.mean().item()}
-    for part, a, b in zip(
-        ("root_pose", "joint_angles", "root_velocity", "joint_velocities"), ends[:-1], ends[1:], strict=True
-    ):
-        out[f"mse_{part}"] = error[:, a:b].mean().item()
-        out[f"mean_mse_{part}"] = spread[:, a:b].mean().item()
+    for part in ("root_pose", "joint_angles", "root_velocity", "joint_velocities"):
+        out[f"mse_{part}"] = error[:, getattr(layout, part)].mean().item()
+        out[f"mean_mse_{part}"] = spread[:, getattr(layout, part)].mean().item()
     return out

@@ -25,8 +25,9 @@ from egopose.data.splits import split_takes
 from egopose.data.store import TakeStore
 from egopose.data.windows import ForecastWindow
 from egopose.envs.mdp.observations import humanoid_state
+from egopose.humanoid.state_layout import StateLayout
 from egopose.models.baselines.path_pose import PathPose
-from egopose.models.baselines.recurrent import RecurrentForecaster, pose_state_size
+from egopose.models.baselines.recurrent import RecurrentForecaster
 from egopose.models.mirror import state_mirror
 from egopose.models.pose_regression import integrate_root, pose_regression, split_state, state_to_qpos
 from egopose.motion import rotations as rot
@@ -176,7 +177,7 @@ def _learner(config: Mapping[str, Any], dataset: Dataset, settings: FitSettings)
     states = humanoid_state(dataset.reference).float()
     seed, own = int(config["seed"]), _own_settings(config["baseline"])
     if _kind(config) == "recurrent":
-        poses = states[:, : pose_state_size(states.shape[1])]
+        poses = states[:, StateLayout.of_size(states.shape[1]).pose]
         recurrent = RecurrentSettings.from_config(own)
         mirror = state_mirror(dataset.humanoid.skeleton).poses() if recurrent.mirror else None
         return RecurrentLearner(poses, spans, recurrent, settings.batch, settings.validation_share, seed, mirror)

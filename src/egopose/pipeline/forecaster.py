@@ -26,6 +26,7 @@ from egopose.data.splits import split_takes
 from egopose.data.store import TakeStore
 from egopose.envs.mdp.observations import humanoid_state
 from egopose.envs.reference_forecasts import ReferenceForecasts
+from egopose.humanoid.state_layout import StateLayout
 from egopose.models.mirror import state_mirror
 from egopose.models.motion_forecast import ContinuedForecaster, KernelForecaster, MotionForecaster, spline_basis
 from egopose.pipeline.regressor import training_contexts
@@ -125,7 +126,7 @@ def _settings(config: Mapping[str, Any]) -> tuple[ForecasterSettings, FitSetting
 def _size(dataset: Dataset) -> int:
     """P: numbers of a humanoid state that are its pose and not its joints' velocities."""
     assert dataset.states is not None
-    return 11 + (dataset.states.shape[1] - 11) // 2
+    return StateLayout.of_size(dataset.states.shape[1]).pose_size
 
 
 def _fps(dataset: Dataset) -> float:

@@ -33,6 +33,7 @@ from egopose.data.splits import split_takes
 from egopose.data.store import TakeStore
 from egopose.envs.mdp.observations import humanoid_state
 from egopose.humanoid.model import HumanoidModel
+from egopose.humanoid.state_layout import StateLayout
 from egopose.models.blended import blended_regressor
 from egopose.models.kernel_regression import KernelRegression
 from egopose.models.mirror import state_mirror
@@ -403,7 +404,7 @@ def load_regressor(weights: str | Path) -> tuple[StateRegressor, dict[str, Any]]
 def joint_targets(states: Tensor, humanoid: HumanoidModel) -> Tensor:
     """Joint angles ``[F, nu]`` rad of humanoid states ``[F, 2 nq - 3]``, within the joints' range."""
     limits = torch.as_tensor(humanoid.joint_range, dtype=states.dtype)
-    return states[:, 5 : 5 + len(limits)].clamp(limits[:, 0], limits[:, 1])
+    return states[:, StateLayout(len(limits)).joint_angles].clamp(limits[:, 0], limits[:, 1])
 
 
 def _report(progress: Progress) -> None:

@@ -19,6 +19,7 @@ from egopose.core.errors import InputError
 from egopose.core.torch_settings import torch_threads
 from egopose.data.spans import Span, without_block
 from egopose.humanoid.model import HumanoidModel
+from egopose.humanoid.state_layout import StateLayout
 from egopose.models.blended import MeanOfKernels, TimeWindows, blended_regressor, kernel_view
 from egopose.models.kernel_regression import KernelRegression, fit_kernel_regression
 from egopose.models.mirror import StateMirror, state_mirror
@@ -267,9 +268,9 @@ def fit_kernels(
 def importance_of(humanoid: HumanoidModel, state_std: Tensor) -> Tensor:
     """``[S]``: the joint angles in rad without the hands, as E_pose has them; nothing else of the state."""
     out = torch.zeros_like(state_std)
-    angles = slice(5, 5 + len(humanoid.joint_range))
+    angles = StateLayout.of_size(len(state_std)).joint_angles
     out[angles] = state_std[angles]
-    out[5 + torch.as_tensor(humanoid.hand_dofs)] = 0.0
+    out[angles][torch.as_tensor(humanoid.hand_dofs)] = 0.0
     return out
 
 
@@ -292,12 +293,14 @@ def share_groups(humanoid: HumanoidModel, state_std: Tensor) -> dict[str, tuple[
     owner = [index for index, joint in enumerate(skeleton.joints) for _ in joint.dofs]
     leg = torch.tensor([index in below for index in owner])
     dofs, hands = torch.arange(len(owner)), set(humanoid.hand_dofs.tolist())
-    velocities = 11 + len(owner)
-    root = torch.cat([torch.arange(5), torch.arange(5 + len(owner), velocities)])
+    layout = StateLayout(len(owner))
+    column = torch.arange(layout.size)
+    angles, velocities = column[layout.joint_angles], column[layout.joint_velocities]
+    root = torch.cat([column[layout.root_pose], column[layout.root_velocity]])
     groups = {"root": (root, root, torch.ones(len(root)))}
     for part, members in (("legs", dofs[leg]), ("upper_body", dofs[~leg])):
-        judged = 5 + torch.tensor([d for d in members.tolist() if d not in hands])
-        groups[part] = (torch.cat([5 + members, velocities + members]), judged, state_std[judged])
+        judged = angles[[d for d in members.tolist() if d not in hands]]
+        groups[part] = (torch.cat([angles[members], velocities[members]]), judged, state_std[judged])
     return groups
 
 

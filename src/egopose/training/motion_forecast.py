@@ -10,6 +10,7 @@ from torch import Tensor
 
 from egopose.core.errors import InputError
 from egopose.data.spans import Span, split_validation, without_block
+from egopose.humanoid.state_layout import StateLayout
 from egopose.models.mirror import StateMirror
 from egopose.models.motion_forecast import MotionForecaster, spline_basis
 from egopose.models.regressor import state_statistics
@@ -154,9 +155,12 @@ def _scales(std: Tensor, hands: Sequence[int]) -> tuple[Tensor, Tensor]:
 
     A small lean is twice the quaternion's x and y; w and z follow from these.
     """
+    layout = StateLayout.of_pose_size(len(std))
     judged, others = std.clone(), torch.zeros_like(std)
-    judged[0], judged[-6:], others[0], others[-6:] = 0.0, 0.0, 1.0, 1.0
-    judged[1:5] = std[1:5] * torch.tensor([0.0, 2.0, 2.0, 0.0])
+    for left_out in (layout.root_height, layout.root_velocity):
+        judged[left_out], others[left_out] = 0.0, 1.0
+    judged[layout.root_rotation] = std[layout.root_rotation] * torch.tensor([0.0, 2.0, 2.0, 0.0])
+    joints, other_joints = judged[layout.joint_angles], others[layout.joint_angles]
     for hand in hands:
-        judged[5 + hand], others[5 + hand] = 0.0, 1.0
+        joints[hand], other_joints[hand] = 0.0, 1.0
     return judged, others

@@ -14,6 +14,7 @@ from torch import Tensor, nn
 from egopose.core.config import from_mapping
 from egopose.core.errors import InputError
 from egopose.data.spans import Span, split_validation
+from egopose.humanoid.state_layout import StateLayout
 from egopose.models.baselines.path_pose import PathPose, cluster_poses, transition_costs
 
 
@@ -137,7 +138,7 @@ class PathPoseLearner:
 
 def _angles_of(states: Tensor) -> Tensor:
     """``[N, 4 + D]`` of z: the root's roll and pitch, as a quaternion, and the joint angles; what E_pose compares."""
-    return states[:, 1 : 5 + (states.shape[1] - 11) // 2].float()
+    return states[:, StateLayout.of_size(states.shape[1]).rotation_and_angles].float()
 
 
 def _angles(states: Tensor) -> np.ndarray:

@@ -14,6 +14,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from egopose.envs.mdp import rotations as rot
+from egopose.humanoid.state_layout import StateLayout
 
 Array = NDArray[np.float64]
 BodyState: TypeAlias = TensorDictBase | Mapping[str, Tensor]
@@ -138,25 +139,27 @@ def humanoid_state_rows(qpos: Array, qvel: Array) -> Array:
     With the heading's cosine and sine (c, s) = (w, z) / |(w, z)| of half its angle, the de-headed root quaternion is
     (|(w, z)|, c x + s y, c y - s x, 0). Rows round alike however many there are.
     """
-    nq = qpos.shape[1]
+    layout = StateLayout(qpos.shape[1] - 7)
     w, x, y, z = qpos[:, 3:7].T
     w = w + 1e-16  # as in rotations.heading: below rounding, unless (w, z) vanishes
     size = np.sqrt(w * w + z * z)
     c, s = w / size, z / size
     cos, sin = c * c - s * s, 2.0 * c * s
     along, across = qvel[:, 0], qvel[:, 1]
-    out = np.empty((len(qpos), 2 * nq - 3))
-    out[:, 0], out[:, 1], out[:, 2], out[:, 3], out[:, 4] = qpos[:, 2], size, c * x + s * y, c * y - s * x, 0.0
-    out[:, 5 : nq - 2] = qpos[:, 7:]
-    out[:, nq - 2], out[:, nq - 1] = cos * along + sin * across, cos * across - sin * along
-    out[:, nq:] = qvel[:, 2:]
+    out = np.empty((len(qpos), layout.size))
+    rotation, linear = out[:, layout.root_rotation], out[:, layout.root_linear_velocity]
+    out[:, layout.root_height] = qpos[:, 2:3]
+    rotation[:, 0], rotation[:, 1], rotation[:, 2], rotation[:, 3] = size, c * x + s * y, c * y - s * x, 0.0
+    out[:, layout.joint_angles] = qpos[:, 7:]
+    linear[:, 0], linear[:, 1], linear[:, 2] = cos * along + sin * across, cos * across - sin * along, qvel[:, 2]
+    out[:, layout.root_angular_velocity] = qvel[:, 3:6]
+    out[:, layout.joint_velocities] = qvel[:, 6:]
     return out
 
 
 def humanoid_state(state: BodyState) -> Tensor:
     """z ``[N, 2 nq - 3]`` (115 numbers at 58 degrees of freedom), float64.
 
-    In order: root height 1, de-headed root quaternion 4, joint angles, root linear velocity in the heading frame 3,
-    root angular velocity in the root frame 3, joint velocities (Yuan & Kitani 2019, section 3, "State").
+    Its parts are named by :class:`egopose.humanoid.state_layout.StateLayout`.
     """
     return BodyView(state).humanoid_state

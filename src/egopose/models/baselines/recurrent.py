@@ -16,11 +16,6 @@ from torch import Tensor, nn
 LstmStates = tuple[Tensor, Tensor]
 
 
-def pose_state_size(state_size: int) -> int:
-    """``11 + D`` of a humanoid state z of ``11 + 2 D`` numbers."""
-    return 11 + (state_size - 11) // 2
-
-
 def ground_truth_mask(length: int, truth: int, own: int, offset: int = 0) -> Tensor:
     """``[length]`` booleans: which inputs are the truth. ``truth`` frames of it, then ``own`` of the network's output.
 
