@@ -10,20 +10,24 @@ import subprocess
 from dataclasses import dataclass, field
 from html.parser import HTMLParser
 from pathlib import Path
+from xml.etree import ElementTree
 
 import cv2
+import matplotlib
 import numpy as np
 import pytest
 from env_stand_in import group
 from hydra import compose, initialize_config_dir
+from hypothesis import Phase, given, settings
+from hypothesis import strategies as st
 
 from egopose.core.config import compose_config
 from egopose.core.config_files import config_dir
 from egopose.core.errors import InputError
-from egopose.evaluation import page
 from egopose.evaluation.agents import FragmentResult, failsafe_figures
-from egopose.evaluation.charts import Line, bar_chart, line_chart, ticks
+from egopose.evaluation.charts import Chart, Line, bar_chart, line_chart
 from egopose.evaluation.estimation_page import ReportSettings, read_takes, worst_and_best, write_report
+from egopose.evaluation.page import Number
 from egopose.evaluation.protocols import METRICS, ContactSettings, score_take
 from egopose.evaluation.report import compare_runs, write_results, write_take
 from egopose.evaluation.reports import run_report
@@ -38,6 +42,7 @@ from egopose.report import main
 SETTINGS = ReportSettings(moments=2, apart=0.3, size=96, takes=None)
 FRAMES = 40
 VOID = {"meta", "img", "br", "path", "rect", "i"}
+SVG_ATTRIBUTES = {"viewBox", "role", "class", "d", "style", "x", "y", "transform"}
 
 
 @dataclass
@@ -168,7 +173,7 @@ def test_the_page_says_what_the_results_say(evaluation: Path, humanoid: Humanoid
     assert [row[2:4] for row in found.tables[2][1:]] == [["2", "2"]] * 2
     assert [row[3] for row in found.tables[3][1:]] == ["7"] * 2
     text = out.read_text()
-    assert "python -m egopose.evaluate &#x27;checkpoint=[a,b]&#x27; report=true" in text
+    assert "python -m egopose.evaluate &#39;checkpoint=[a,b]&#39; report=true" in text
     assert "rendered from real motion capture" in text
     assert "Content-Security-Policy" in text
     # One table of joints: its mean over joints and takes is the figure of the first run.
@@ -263,19 +268,71 @@ def test_a_configuration_can_be_read_within_hydras_main() -> None:
         assert compose("export").part == "estimate"  # Hydra's own instance is as it was
 
 
-def test_charts() -> None:
-    chart = line_chart([Line("a & b", [0, 1, 2, 3], [1.0, np.nan, 2.0, 3.0])], "s", "mm", [1.5])
-    line = re.search(r'class="line"[^>]* d="([^"]*)"', chart)
-    assert line is not None
-    assert line.group(1).count("M") == 2  # broken where there is no figure
-    assert "a &amp; b" in chart
-    assert chart.count('class="mark"') == 1
-    assert "no figures" in line_chart([Line("a", [0.0], [np.nan])], "s", "mm")
-    heights = re.findall(r'height="([\d.]+)" fill', bar_chart(["x", "y"], {"ours": [1.0, 2.0]}, "mm"))
-    assert float(heights[1]) == pytest.approx(2 * float(heights[0]), abs=0.2)
-    np.testing.assert_allclose(ticks(0.0, 1.0, 5), [0, 0.2, 0.4, 0.6, 0.8, 1.0])
-    assert len(ticks(-3.0, 977.0, 6)) <= 7
-    assert page.number(float("nan")) == "<td>-</td>"
+def paths(chart: Chart, kind: str) -> list[str]:
+    """What the chart's lines, bands, bars or marks are drawn along."""
+    return re.findall(rf'<g class="{kind}">(?:<title>[^<]*</title>)?<path d="([^"]*)"', chart.svg)
+
+
+def points(path: str) -> np.ndarray:
+    """``[N, 2]`` of a path; y points down."""
+    return np.array([pair.split()[-2:] for pair in re.findall(r"[ML] \S+ \S+", path)], dtype=float)
+
+
+def test_a_line_is_drawn_to_scale_and_broken_where_there_is_no_figure() -> None:
+    chart = line_chart([Line("a & b", [0, 1, 2, 3, 4], [1.0, np.nan, 2.0, 3.0, 7.0])], "s", "mm", [1.5])
+    (line,) = paths(chart, "line")
+    assert line.count("M") == 2
+    drawn = points(line)[-3:]
+    np.testing.assert_allclose(np.diff(drawn[:, 1])[1], 4 * np.diff(drawn[:, 1])[0], atol=0.3)
+    np.testing.assert_allclose(np.diff(drawn[:, 0])[1], np.diff(drawn[:, 0])[0], atol=0.2)
+    assert "<title>a &amp; b</title>" in chart.svg
+    assert len(paths(chart, "mark")) == 1
+    assert chart.colours == {"a & b": "#0072b2"}
+    banded = line_chart([Line("a", [0, 1, 2], [1.0, 2.0, 3.0], [[0, 1, np.nan], [2, 3, 4]])], "s", "mm")
+    assert len(paths(banded, "band")) == 1
+    assert points(paths(banded, "band")[0])[:, 0].max() < points(paths(banded, "line")[0])[:, 0].max()
+    assert not line_chart([Line("a", [0.0], [np.nan])], "s", "mm").svg
+    assert not line_chart([], "s", "mm").svg
+
+
+def test_bars_are_as_high_as_their_figures() -> None:
+    chart = bar_chart(["x", "y", "z"], {"ours": [1.0, 2.0, np.nan]}, "mm")
+    heights = [float(np.ptp(points(path)[:, 1])) for path in paths(chart, "bar")]
+    assert len(heights) == 2  # none where there is no figure
+    assert heights[1] == pytest.approx(2 * heights[0], abs=0.2)
+    assert "<title>y, ours: 2</title>" in chart.svg
+
+
+@given(st.lists(st.text(), min_size=1, max_size=3, unique=True), st.text())
+@settings(max_examples=12, deadline=None, phases=(Phase.generate,))
+def test_no_name_gets_into_a_charts_markup(names: list[str], axis: str) -> None:
+    """It is one element with text as it was given, but for control characters, which no XML holds."""
+    lines = [Line(name, [0.0, 1.0], [k, 1.0], [[0.0, 1.0], [2.0, 3.0]]) for k, name in enumerate(names)]
+    for chart in (line_chart(lines, axis, axis), bar_chart(names, {axis: np.ones(len(names))}, axis)):
+        root = ElementTree.fromstring(chart.svg)
+        assert {part.tag for part in root.iter()} <= {"svg", "g", "path", "text", "title", "tspan"}
+        assert {key for part in root.iter() for key in part.attrib} <= SVG_ATTRIBUTES
+        said = {part.text or "" for part in root.iter("title")}
+        if 'class="line"' in chart.svg:
+            assert said == {"".join(c if c.isprintable() else "\ufffd" for c in name) for name in names}
+
+
+def test_a_charts_ink_is_the_pages_and_two_in_a_page_do_not_meet() -> None:
+    chart = line_chart([Line("a", [0, 1], [1.0, 2.0])], "s", "mm")
+    assert "stroke: currentColor" in chart.svg
+    assert "#000" not in chart.svg
+    assert not re.search(r"\bid=|url\(|<style|href", chart.svg)
+    matplotlib.rcParams["text.color"] = "red"
+    try:
+        assert line_chart([Line("a", [0, 1], [1.0, 2.0])], "s", "mm") == chart
+    finally:
+        matplotlib.rcdefaults()
+
+
+def test_a_figure_that_is_not_there_is_a_dash() -> None:
+    assert Number(float("nan")).known is False
+    assert Number(None).known is False
+    assert Number(0.0).known is True
 
 
 @pytest.mark.skipif(shutil.which("chromium") is None, reason="no Chromium on this machine")

@@ -17,7 +17,6 @@ import pytest
 import torch
 from mocap import short_clips
 
-from egopose import dataset
 from egopose.checkpoint.checkpoint import RunCheckpoint, find_checkpoint, metadata_of
 from egopose.core.config import compose_config
 from egopose.core.errors import InputError
@@ -25,6 +24,7 @@ from egopose.data import preparation
 from egopose.data.lock import store_lock
 from egopose.data.preparation import fingerprint_of, flow_name, humanoid_of, prepare, store_folder
 from egopose.data.store import TakeStore
+from egopose.pipeline import dataset
 from egopose.pipeline import regressor as regression
 from egopose.pipeline.agent import load_agent
 from egopose.pipeline.dataset import load_dataset, run_dataset
@@ -224,9 +224,10 @@ def hold(root: Path, seconds: float) -> subprocess.Popen[str]:
 
 
 def test_a_second_preparation_waits_and_says_so(made: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    settings = configuration(made)  # composing it may take longer than the other process holds the store
     process = hold(made / "store", 1.0)
     began = time.monotonic()
-    prepare(configuration(made), progress=False, flow=False)
+    prepare(settings, progress=False, flow=False)
     assert time.monotonic() - began > 0.5
     assert process.wait(10) == 0
     said = capfd.readouterr().err

@@ -9,6 +9,7 @@ import signal
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from tensordict import TensorDict
@@ -96,6 +97,40 @@ def test_full_batch_and_fixed_step_size(tmp_path: Path) -> None:
     assert figures["policy_lr"] == SETTINGS["policy_lr"]
     steps = run.ppo.policy_optimizer.state_dict()["state"][0]["step"]
     assert steps == 2
+
+
+@pytest.mark.parametrize(
+    ("kl", "before", "after"),
+    [
+        (0.05, 3e-3, 3e-3 / 1.5),  # beyond twice the target of 0.02
+        (0.04, 3e-3, 3e-3),
+        (0.01, 3e-3, 3e-3),
+        (0.009, 3e-3, 3e-3 * 1.5),  # below half of it
+        (0.0, 3e-3, 3e-3),  # a policy that did not move says nothing of its step size
+        (0.05, 1.1e-4, 1e-4),  # the range ends
+        (0.009, 9e-3, 1e-2),
+        (float("inf"), 3e-3, 3e-3 / 1.5),
+        (float("nan"), 3e-3, 3e-3),
+    ],
+)
+def test_the_step_size_follows_the_divergence(
+    kl: float, before: float, after: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Rudin et al. 2022: divided by 1.5 beyond twice the target, times 1.5 below half of it, within its range."""
+    run = make_run(tmp_path, epochs=1)
+    monkeypatch.setattr(run.ppo, "divergence", lambda _: kl)
+    run.ppo.policy_optimizer.param_groups[0]["lr"] = before
+    assert iterate(run, iter(run.collector))["policy_lr"] == pytest.approx(after, rel=1e-12)
+
+
+def test_the_explained_variance_is_that_of_the_critic_before_the_update(tmp_path: Path) -> None:
+    run = make_run(tmp_path)
+    rows = run.ppo.advantages(next(iter(run.collector)))
+    value = run.ppo.critic(rows.select(*run.ppo.critic.in_keys))["state_value"].detach().numpy()
+    target = rows["value_target"].numpy()
+    expected = 1 - np.var(target - value) / np.var(target)
+    assert run.ppo.update(rows)["explained_variance"] == pytest.approx(expected, abs=1e-5)
+    assert "explained_variance" not in run.ppo.loss(rows)
 
 
 def test_a_fall_bootstraps_nothing_and_the_time_limit_does() -> None:
@@ -213,6 +248,8 @@ def test_tensorboard_events_are_written(tmp_path: Path) -> None:
         ("policy_lr", "fast", "policy_lr"),
         ("minibatch_size", 1, "minibatch_size"),
         ("policy_lr_range", [1e-4], "policy_lr_range"),
+        ("policy_lr_range", [1e-3, 1e-4], "policy_lr_range"),
+        ("target_kl", 0.0, "target_kl"),
     ],
 )
 def test_wrong_settings_name_their_field(key: str, value: Any, field: str) -> None:

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import fcntl
 import json
-import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from filelock import FileLock, Timeout
 from hydra.core.override_parser.overrides_parser import OverridesParser
 
 from egopose.checkpoint.checkpoint import read_json, recover
@@ -116,16 +115,12 @@ def only_process(folder: Path) -> Iterator[None]:
     Raises:
         InputError: another process is training there.
     """
-    if sys.platform == "win32":  # no flock there
-        yield
-        return
-
     folder.mkdir(parents=True, exist_ok=True)
-    with (folder / ".lock").open("w") as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise InputError(folder, "run directory", "another process is training in it") from None
+    try:
+        held = FileLock(folder / ".lock").acquire(blocking=False)
+    except Timeout:
+        raise InputError(folder, "run directory", "another process is training in it") from None
+    with held:
         yield
 
 

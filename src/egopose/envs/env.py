@@ -47,8 +47,8 @@ def _joined(steps: list[_Unrewarded]) -> _Unrewarded:
 def _step_parts(arrays: Mapping[str, Tensor]) -> dict[str, Any]:
     """Keyword arguments of a problem's ``step_view``."""
     parts: dict[str, Any] = {name: arrays[name] for name in ("torques", "target", "scene") if name in arrays}
-    if "floor" in arrays:
-        parts["contacts"] = Contacts(arrays["floor"], arrays["boxes"])
+    if "floor_contacts" in arrays:
+        parts["contacts"] = Contacts(arrays["floor_contacts"], arrays["box_contacts"])
     return parts
 
 
@@ -354,24 +354,22 @@ class EgoPoseEnv(EnvBase):
             self._targets[worlds] = target
         return target.numpy()
 
-    def _watched(self, worlds: slice) -> dict[str, Tensor]:
-        """What the problem watches of the present step beside the body, copies ``[n, ...]``."""
-        physics, watched = self.physics, self.problem.watched
-        out: dict[str, NDArray[Any]] = {}
-        if "contacts" in watched:
-            out["floor"], out["boxes"] = physics.floor_contacts[worlds], physics.box_contacts[worlds]
-        if "torques" in watched:
-            out["torques"] = physics.torques[worlds]
-        if "scene" in watched:
-            out["scene"] = np.concatenate([physics.box_tops[worlds], physics.box_quaternions[worlds]], axis=-1)
-        tensors = {name: torch.from_numpy(np.array(value)) for name, value in out.items()}
-        return tensors | ({"target": self._targets[worlds].clone()} if "target" in watched else {})
+    def _watched(self, body: dict[str, Tensor], worlds: slice) -> dict[str, Tensor]:
+        """What the problem watches of the present step beside the body, taken out of ``body``."""
+        tops, turns = body.pop("box_tops", None), body.pop("box_quaternions", None)
+        parts = {name: body.pop(name) for name in ("floor_contacts", "box_contacts", "torques") if name in body}
+        if "scene" in self.problem.watched:
+            assert tops is not None and turns is not None, "a problem that watches the scene has boxes"
+            parts["scene"] = torch.cat([tops, turns], dim=-1)
+        if "target" in self.problem.watched:
+            parts["target"] = self._targets[worlds].clone()
+        return parts
 
     def _arrived(self, stopped: NDArray[np.bool_], worlds: slice) -> dict[str, Any]:
         body = {k: torch.from_numpy(v) for k, v in self.physics.body_state(worlds).items()}
         clock = self._clock(worlds)
         frame, steps = clock["frame"].squeeze(-1), clock["episode_step"].squeeze(-1)
-        parts = self._watched(worlds)
+        parts = self._watched(body, worlds)
         view = self.problem.step_view(body, frame, steps, **_step_parts(parts))
         endings = self.problem.ended(view, torch.from_numpy(self._take[worlds]))
         terminated = stopped

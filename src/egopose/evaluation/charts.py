@@ -1,21 +1,51 @@
-"""Charts as inline SVG: lines over a common x, bars side by side. Text and axes take the page's colour."""
+"""Charts as inline SVG, drawn by matplotlib: lines over a common x, bars side by side.
+
+Ink takes the page's colour, so that a chart is readable on light and on dark ground. matplotlib is imported where a
+chart is drawn: it takes half a second.
+"""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping, Sequence
+import io
+import re
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
-from html import escape
+from typing import Any
+from xml.etree import ElementTree
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 #: Told apart with any colour vision (Okabe & Ito 2008), on light and on dark ground.
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#8c6bb1", "#7f7f7f")
 
-_WIDTH, _HEIGHT = 760, 260
-_LEFT, _RIGHT, _TOP, _BOTTOM = 62, 12, 26, 40
+_WIDTH, _HEIGHT = 760, 260  # points; the page scales them to its width
+_NAMES = 60  # points more where names stand below the axis
+_LONGEST = 24  # letters of such a name; the whole one is said where the pointer rests on the bar
 _MOST_POINTS = 800
+_INK = "#000000"  # text of this colour is written without one and so takes the page's; strokes are told to
+_STYLE = {
+    "svg.fonttype": "none",  # text as text: a fifth of its size as outlines, and found by the browser's search
+    "text.parse_math": False,  # a dollar sign in a name is one
+    "font.family": "sans-serif",
+    "font.size": 12,
+    "xtick.labelsize": 11,
+    "ytick.labelsize": 11,
+    "axes.titlesize": 12,
+    "axes.titlelocation": "left",
+    "axes.spines.left": False,
+    "axes.spines.right": False,
+    "axes.spines.top": False,
+    "axes.axisbelow": True,
+    "axes.grid": True,
+    "axes.grid.axis": "y",
+    "grid.color": "#888888",
+    "grid.alpha": 0.2,
+    "xtick.major.size": 0,
+    "ytick.major.size": 0,
+}
 
 
 @dataclass(frozen=True)
@@ -28,157 +58,136 @@ class Line:
     band: ArrayLike | None = None
 
 
+@dataclass(frozen=True)
+class Chart:
+    """What a page shows: ``svg`` (markup, "" where there are no figures), ``colours`` by label, ``label`` of y."""
+
+    svg: str
+    colours: Mapping[str, str]
+    label: str
+
+
 def line_chart(
     lines: Sequence[Line], x_label: str, y_label: str, marks: ArrayLike = (), order: Sequence[str] | None = None
-) -> str:
-    """An SVG of curves with legend, axes and ticks.
+) -> Chart:
+    """Curves with axes and ticks; y begins at zero or below.
 
     Args:
-        lines: at least one with a finite point.
+        lines: those without a finite point are not drawn.
         x_label, y_label: with units.
         marks: x of dashed vertical lines.
         order: labels in the order colours are given in, for charts of which some lack lines; the lines' by default.
     """
-    xs = [np.asarray(line.x, dtype=np.float64) for line in lines]
-    ys = [np.asarray(line.y, dtype=np.float64) for line in lines]
-    bands = [None if line.band is None else np.asarray(line.band, dtype=np.float64) for line in lines]
-    drawn = [*ys, *(band.ravel() for band in bands if band is not None)]
-    finite = np.concatenate([y[np.isfinite(y)] for y in drawn]) if drawn else np.empty(0)
-    if not len(finite):
-        return f"<p>{escape(y_label)}: no figures.</p>"
-    every_x = np.concatenate(xs)
-    x_low, x_high = _padded(float(every_x.min()), float(every_x.max()), grow=False)
-    y_low, y_high = _padded(min(float(finite.min()), 0.0), float(finite.max()), grow=True)
-    to_x = _Scale(x_low, x_high, _LEFT, _WIDTH - _RIGHT)
-    to_y = _Scale(y_low, y_high, _HEIGHT - _BOTTOM, _TOP)
-    parts = _axes(x_low, x_high, y_low, y_high, x_label, y_label)
-    for x in np.asarray(marks, dtype=np.float64):
-        parts.append(f'<path class="mark" d="M{to_x(x):.1f} {_TOP}V{_HEIGHT - _BOTTOM}"/>')
-    labels = [line.label for line in lines]
-    colours = _colours(labels, order)
-    for line, x, y, band in zip(lines, xs, ys, bands, strict=True):
-        colour = colours[line.label]
-        step = -(-len(x) // _MOST_POINTS)
-        if band is not None:
-            area = _area(x[::step], band[:, ::step], to_x, to_y)
-            parts.append(f'<path class="band" fill="{colour}" fill-opacity=".15" d="{area}"/>')
-        path = _path(x[::step], y[::step], to_x, to_y)
-        parts.append(f'<path class="line" stroke="{colour}" d="{path}"><title>{escape(line.label)}</title></path>')
-    return _svg(parts, _HEIGHT) + _legend(colours)
+    colours = _colours([line.label for line in lines], order)
+    if not any(np.isfinite(np.asarray(part, dtype=np.float64)).any() for line in lines for part in (line.y, line.band)):
+        return Chart("", colours, y_label)
+    with _drawing(_HEIGHT, y_label) as (figure, axes):
+        titles = {}
+        for k, line in enumerate(lines):
+            step = -(-max(np.size(line.x), 1) // _MOST_POINTS)
+            x, y = (np.asarray(v, dtype=np.float64)[::step] for v in (line.x, line.y))
+            colour, name = colours[line.label], f"line-{k}"
+            if line.band is not None:
+                low, high = np.asarray(line.band, dtype=np.float64)[:, ::step]
+                there = np.isfinite(low) & np.isfinite(high)
+                around = (np.concatenate([v[there], w[there][::-1]]) for v, w in ((x, x), (low, high)))
+                axes.fill(*around, color=colour, alpha=0.15, linewidth=0, gid=f"band-{k}", clip_on=False)
+            axes.plot(x, y, color=colour, linewidth=1.6, gid=name, clip_on=False)
+            titles[name] = line.label
+        axes.set_ylim(bottom=min(0.0, axes.dataLim.y0))
+        for k, x in enumerate(np.asarray(marks, dtype=np.float64)):
+            axes.axvline(x, color="#888888", linewidth=1, linestyle=(0, (3, 3)), gid=f"mark-{k}", clip_on=False)
+        axes.set_xlabel(_plain(x_label))
+        axes.xaxis.set_major_formatter("{x:.6g}")
+        return Chart(_svg(figure, titles), colours, y_label)
 
 
 def bar_chart(
     groups: Sequence[str], bars: Mapping[str, ArrayLike], y_label: str, order: Sequence[str] | None = None
-) -> str:
-    """An SVG of bars, a group a name, a bar in each group for every series ``[groups]``; ``order`` as of lines."""
+) -> Chart:
+    """Bars, a group a name, a bar in each group for every series ``[groups]``; ``order`` as of lines."""
     colours = _colours(list(bars), order)
-    series = {label: np.asarray(values, dtype=np.float64) for label, values in bars.items()}
-    height = _HEIGHT + 60  # names stand on end below the axis
-    floor = height - _BOTTOM - 60
-    top = max((float(np.nanmax(v)) for v in series.values() if np.isfinite(v).any()), default=0.0)
-    low, high = _padded(0.0, top, grow=True)
-    to_y = _Scale(low, high, floor, _TOP)
-    parts = _y_axis(low, high, to_y, y_label)
-    parts.append(f'<path class="axis" d="M{_LEFT} {floor}H{_WIDTH - _RIGHT}"/>')
-    slot = (_WIDTH - _LEFT - _RIGHT) / max(len(groups), 1)
-    width = 0.8 * slot / max(len(series), 1)
-    for g, group in enumerate(groups):
-        left = _LEFT + slot * g
-        middle = left + slot / 2
-        parts.append(
-            f'<text class="tick" text-anchor="end" transform="translate({middle + 4:.1f} {floor + 8})'
-            f' rotate(-60)">{escape(group)}</text>'
+    width = 0.8 / max(len(bars), 1)
+    with _drawing(_HEIGHT + _NAMES, y_label) as (figure, axes):
+        titles = {}
+        for k, (label, values) in enumerate(bars.items()):
+            left = np.arange(len(groups)) - 0.4 + k * width
+            heights = np.asarray(values, dtype=np.float64)
+            drawn = axes.bar(left, heights, width, align="edge", color=colours[label], clip_on=False)
+            for g, (bar, height) in enumerate(zip(drawn, heights, strict=True)):
+                bar.set_gid(f"bar-{k}-{g}")
+                bar.set_visible(bool(np.isfinite(height)))
+                titles[f"bar-{k}-{g}"] = f"{groups[g]}, {label}: {height:.4g}"
+        axes.set_xlim(-0.5, max(len(groups), 1) - 0.5)
+        axes.set_ylim(bottom=0.0)
+        axes.set_xticks(
+            range(len(groups)), [_plain(g)[:_LONGEST] for g in groups], rotation=60, ha="right", rotation_mode="anchor"
         )
-        for k, (label, values) in enumerate(series.items()):
-            if not np.isfinite(values[g]):
-                continue
-            y = to_y(values[g])
-            said = escape(f"{group}, {label}: {values[g]:.4g}")
-            parts.append(
-                f'<rect x="{left + 0.1 * slot + k * width:.1f}" y="{y:.1f}" width="{width:.1f}"'
-                f' height="{max(floor - y, 0):.1f}" fill="{colours[label]}"><title>{said}</title></rect>'
-            )
-    return _svg(parts, height) + _legend(colours)
+        return Chart(_svg(figure, titles), colours, y_label)
 
 
-def ticks(low: float, high: float, most: int = 6) -> NDArray[np.float64]:
-    """Round numbers from ``low`` to ``high``: steps of 1, 2 or 5 times a power of ten, at most ``most`` + 1 of them."""
-    rough = (high - low) / most
-    power = 10.0 ** math.floor(math.log10(rough))
-    step = next(m * power for m in (1, 2, 5, 10) if m * power >= rough * (1 - 1e-9))
-    return np.asarray(
-        step * np.arange(math.ceil(low / step - 1e-9), math.floor(high / step + 1e-9) + 1), dtype=np.float64
-    )
+@contextmanager
+def _drawing(height: float, y_label: str) -> Iterator[tuple[Any, Any]]:
+    """A figure and its axes, with the style of all charts until it is written."""
+    import matplotlib.style
+    from matplotlib.figure import Figure
+
+    # From the defaults: a matplotlibrc of the user does not reach a report.
+    with matplotlib.style.context(["default", _STYLE]), warnings.catch_warnings():
+        # Names in scripts that matplotlib's font lacks: the browser has its own.
+        warnings.filterwarnings("ignore", message="Glyph .* missing from font", category=UserWarning)
+        figure = Figure(figsize=(_WIDTH / 72, height / 72), layout="constrained")
+        axes = figure.add_subplot()
+        axes.margins(x=0.0, y=0.06)
+        axes.set_title(_plain(y_label))
+        axes.yaxis.set_major_formatter("{x:.6g}")
+        yield figure, axes
 
 
-def _padded(low: float, high: float, *, grow: bool) -> tuple[float, float]:
-    if high - low < 1e-12 * max(abs(low), abs(high), 1.0):
-        return low, low + 1.0
-    return low, high + (0.06 * (high - low) if grow else 0.0)
+def _svg(figure: Any, titles: Mapping[str, str]) -> str:
+    """The figure as an element for a page of HTML.
+
+    Args:
+        figure: of matplotlib.
+        titles: what is said of a part, by the part's name, when the pointer rests on it.
+    """
+    stream = io.StringIO()
+    figure.savefig(stream, format="svg", transparent=True)
+    root = ElementTree.fromstring(stream.getvalue())
+    for part in list(root):
+        if not part.tag.endswith("}g"):  # licence metadata, and a style sheet that would be the whole page's
+            root.remove(part)
+    for part in root.iter():
+        part.tag = part.tag.rpartition("}")[2]  # HTML knows SVG without its namespace
+        part.text = None if len(part) else part.text
+        part.tail = None
+        name = part.attrib.pop("id", "")  # several charts stand in one page
+        if name in titles:
+            part.insert(0, said := ElementTree.Element("title"))
+            said.text = _plain(titles[name])
+        if kind := re.fullmatch(r"(line|band|mark|bar)(-\d+)+", name):
+            part.set("class", kind[1])
+        part.attrib.pop("clip-path", None)  # by name as well; nothing lies outside the axes
+        if "style" in part.attrib:
+            style = re.sub(r"font-family: [^;]*;\s*", "", part.attrib["style"])  # the page's own
+            part.set("style", style.replace(f"stroke: {_INK}", "stroke: currentColor"))
+        if "d" in part.attrib:
+            part.set("d", _rounded(part.attrib["d"]))
+    root.attrib = {"viewBox": root.attrib["viewBox"], "role": "img"}
+    return ElementTree.tostring(root, encoding="unicode")
 
 
-class _Scale:
-    """Linear from data to pixels."""
-
-    def __init__(self, low: float, high: float, start: float, stop: float) -> None:
-        self._low, self._start, self._per = low, start, (stop - start) / (high - low)
-
-    def __call__(self, value: float) -> float:
-        return self._start + (value - self._low) * self._per
+def _rounded(path: str) -> str:
+    """To a tenth of a point, on one line: a third of the size."""
+    return " ".join(re.sub(r"-?\d+\.\d+", lambda number: f"{float(number[0]):.1f}", path).split())
 
 
-def _axes(x_low: float, x_high: float, y_low: float, y_high: float, x_label: str, y_label: str) -> list[str]:
-    floor = _HEIGHT - _BOTTOM
-    to_x = _Scale(x_low, x_high, _LEFT, _WIDTH - _RIGHT)
-    parts = _y_axis(y_low, y_high, _Scale(y_low, y_high, floor, _TOP), y_label)
-    parts.append(f'<path class="axis" d="M{_LEFT} {floor}H{_WIDTH - _RIGHT}"/>')
-    for value in ticks(x_low, x_high, 8):
-        parts.append(
-            f'<text class="tick" text-anchor="middle" x="{to_x(value):.1f}" y="{floor + 16}">{value:.6g}</text>'
-        )
-    middle = (_LEFT + _WIDTH - _RIGHT) / 2
-    parts.append(f'<text text-anchor="middle" x="{middle}" y="{_HEIGHT - 6}">{escape(x_label)}</text>')
-    return parts
-
-
-def _y_axis(low: float, high: float, to_y: _Scale, label: str) -> list[str]:
-    parts = [f'<text x="4" y="14">{escape(label)}</text>']
-    for value in ticks(low, high, 5):
-        y = to_y(value)
-        parts.append(f'<path class="grid" d="M{_LEFT} {y:.1f}H{_WIDTH - _RIGHT}"/>')
-        parts.append(f'<text class="tick" text-anchor="end" x="{_LEFT - 6}" y="{y + 4:.1f}">{value:.6g}</text>')
-    return parts
-
-
-def _path(x: NDArray[np.float64], y: NDArray[np.float64], to_x: _Scale, to_y: _Scale) -> str:
-    out, pen = [], "M"
-    for a, b in zip(x.tolist(), y.tolist(), strict=True):
-        if not math.isfinite(b):
-            pen = "M"
-            continue
-        out.append(f"{pen}{to_x(a):.1f} {to_y(b):.1f}")
-        pen = "L"
-    return "".join(out)
-
-
-def _area(x: NDArray[np.float64], band: NDArray[np.float64], to_x: _Scale, to_y: _Scale) -> str:
-    """The ground between two curves, where both are finite."""
-    there = np.isfinite(band).all(axis=0)
-    low, high = (_path(x[there], edge[there], to_x, to_y) for edge in band)
-    back = "L".join(reversed(high.removeprefix("M").split("L")))
-    return f"{low}L{back}Z" if there.any() else ""
-
-
-def _svg(parts: Sequence[str], height: int) -> str:
-    return f'<svg viewBox="0 0 {_WIDTH} {height}" role="img">{"".join(parts)}</svg>'
+def _plain(text: str) -> str:
+    """Without control characters, which XML cannot hold."""
+    return "".join(c if c.isprintable() else "\ufffd" for c in str(text))
 
 
 def _colours(labels: Sequence[str], order: Sequence[str] | None) -> dict[str, str]:
     """Label -> colour, by its place in ``order``; anew after eight."""
     places = list(labels if order is None else order)
     return {label: COLOURS[places.index(label) % len(COLOURS)] for label in labels}
-
-
-def _legend(colours: Mapping[str, str]) -> str:
-    keys = (f'<span><i style="background:{colour}"></i>{escape(label)}</span>' for label, colour in colours.items())
-    return f'<p class="legend">{"".join(keys)}</p>'

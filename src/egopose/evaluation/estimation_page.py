@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from html import escape
 from pathlib import Path
 from typing import Any
 
@@ -16,8 +15,8 @@ import numpy as np
 
 from egopose.core.errors import InputError
 from egopose.core.safe_io import read_json
-from egopose.evaluation import charts, page
-from egopose.evaluation.charts import Line
+from egopose.evaluation.charts import Chart, Line, bar_chart, line_chart
+from egopose.evaluation.page import DAMAGED, Number, Picture, Table, labelled, render, result_cell
 from egopose.evaluation.protocols import METRICS
 from egopose.evaluation.report import rendered_notes
 from egopose.humanoid.model import HumanoidModel
@@ -27,6 +26,8 @@ from egopose.motion.rotations import Array
 from egopose.vision.rendering import side_view_frames
 
 REPORT = "report.html"
+SHOWN = ("E_pose", "E_vel", "A_accl", "mpjpe_root_aligned", "root_drift")  # metrics of one take, one job
+_DISTANCE = "MPJPE, roots aligned (mm)"
 
 
 @dataclass(frozen=True)
@@ -84,19 +85,23 @@ def write_report(folder: Path, humanoid: HumanoidModel | None, settings: ReportS
         raise InputError(folder / "results.json", "figures", "is no result of `egopose evaluate`")
     takes = read_takes(folder)
     try:
-        sections = [
-            ("What was evaluated", _about(results)),
-            ("Figures", figures_table(results)),
-            ("Frames survived", _survival(results)),
-            ("Fail-safe", _failsafe(results)),
-            ("Takes", _takes_table(results)),
-            ("Error over time", _over_time(takes, settings)),
-            ("Error by joint", _by_joint(takes)),
-            ("Best and worst moments", _moments(takes, humanoid, settings)),
-        ]
-    except (KeyError, TypeError, AttributeError, IndexError) as error:
+        html = render(
+            "estimation.html",
+            title=f"Evaluation: {results.get('split', '')}",
+            data=results,
+            **_about(results),
+            figures=figures_table(results),
+            survival=_survival(results),
+            **_failsafe(results.get("failsafe", [])),
+            takes=_takes_table(results),
+            mean_error=_mean_error(takes),
+            curves=[_curves(take) for take in takes[: settings.takes]],
+            **_by_joint(takes),
+            **_moments(takes, humanoid, settings),
+        )
+    except DAMAGED as error:
         raise InputError(folder / "results.json", "figures", f"is damaged: {error!r}") from None
-    out.write_text(page.page(f"Evaluation: {results.get('split', '')}", sections, results), encoding="utf-8")
+    out.write_text(html, encoding="utf-8")
     return out
 
 
@@ -121,50 +126,44 @@ def read_takes(folder: Path) -> list[TakeMotions]:
     return takes
 
 
-def figures_table(results: Mapping[str, Any]) -> str:
+def figures_table(results: Mapping[str, Any]) -> Table:
     """The table of ``results.json``, a row a metric: methods with intervals, ratios, and the reference's own value."""
     methods, divided, baseline = list(results["figures"]), list(results["ratios"]), results["baseline"]
     header = ["metric", *methods, *(f"{m} / {baseline}" for m in divided), "reference"]
-    rows = []
+    rows: list[list[Any]] = []
     for metric in METRICS:
-        cells = [page.text(f"{metric.label} ({metric.unit})" if metric.unit else metric.label)]
+        cells: list[Any] = [labelled(metric)]
         for part, names, decimals in (("figures", methods, metric.decimals), ("ratios", divided, 3)):
-            for name in names:
-                result = results[part][name].get(metric.key)
-                between = (result["low"], result["high"]) if result and result["low"] is not None else None
-                cells.append(page.number(result["value"] if result else None, decimals, between))
-        cells.append(page.number(results.get("reference", {}).get(metric.key), metric.decimals))
-        rows.append(cells)
-    resets = [page.number(results["resets"][m], 1) for m in methods]
-    rows.append([page.text("resets"), *resets, *(page.text("") for _ in divided), page.text("")])
-    level = results.get("settings", {}).get("interval", {}).get("level")
-    said = f"{100 * level:g} % intervals" if isinstance(level, float) else "Intervals"
-    return page.table(header, rows) + f'<p class="note">{said} over runs and takes, by bootstrap.</p>'
+            cells += [result_cell(results[part][name].get(metric.key), decimals) for name in names]
+        rows.append([*cells, Number(results.get("reference", {}).get(metric.key), metric.decimals)])
+    rows.append(["resets", *(Number(results["resets"][m], 1) for m in methods), *("" for _ in divided), ""])
+    return Table(header, rows)
 
 
-def _about(results: Mapping[str, Any]) -> str:
-    runs = len(next(iter(results["per_take"][next(iter(results["per_take"]))].values())))
-    lines = [
-        f"<p>{runs} run{'s' if runs > 1 else ''} on {len(results['takes'])} fragments, split "
-        f"{escape(str(results.get('split')))}. Curves and pictures are of the first run.</p>"
-    ]
-    lines += [f"<p><strong>{escape(note)}</strong></p>" for note in rendered_notes(results)]
-    lines += [f"<p>Checkpoint: <code>{escape(str(c))}</code></p>" for c in results.get("checkpoints", [])]
-    if command := results.get("command"):
-        lines.append(f"<p>Made by</p><pre>{escape(str(command))}</pre>")
-    return "".join(lines)
+def _about(results: Mapping[str, Any]) -> dict[str, Any]:
+    return {
+        "runs": len(next(iter(results["per_take"][next(iter(results["per_take"]))].values()))),
+        "split": results.get("split"),
+        "notes": rendered_notes(results),
+        "checkpoints": results.get("checkpoints", []),
+        "command": results.get("command"),
+        "level": results.get("settings", {}).get("interval", {}).get("level"),
+    }
 
 
-def _survival(results: Mapping[str, Any]) -> str:
+def _survival(results: Mapping[str, Any]) -> Table:
     rows = [
-        [page.text(run), page.text(name.replace("_", " ")), page.number(f["frames"], 1), page.number(f["fell"], 2)]
+        [run, name.replace("_", " "), Number(f["frames"], 1), Number(f["fell"], 2)]
         for run, result in enumerate(results.get("survival", []))
         for name, f in result.items()
     ]
-    return page.table(["run", "controller", "frames until a fall", "share that fell"], rows)
+    return Table(["run", "controller", "frames until a fall", "share that fell"], rows)
 
 
-def _failsafe(results: Mapping[str, Any]) -> str:
+def _failsafe(runs: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """A row a run, and one a trigger of the first run."""
+    if not runs:
+        return {"failsafe": None}
     keys = (
         "triggers",
         "foreseen",
@@ -175,91 +174,91 @@ def _failsafe(results: Mapping[str, Any]) -> str:
         "median_lead_frames",
         "reset_threshold",
     )
-    runs = results.get("failsafe", [])
     header = ["run", "mode", *(key.replace("_", " ") for key in keys), "fallen (% of frames)"]
     rows = [
         [
-            page.text(run),
-            page.text(result["mode"]),
-            *(page.number(result[key], 3 if key == "reset_threshold" else 0) for key in keys),
-            page.number(100 * result["fallen_share"], 1),
+            run,
+            result["mode"],
+            *(Number(result[key], 3 if key == "reset_threshold" else 0) for key in keys),
+            Number(100 * result["fallen_share"], 1),
         ]
         for run, result in enumerate(runs)
     ]
-    if not rows:
-        return '<p class="note">Not judged: evaluate anew, older evaluations did not.</p>'
     each = [
-        [
-            page.text(take["take"]),
-            page.text(t["frame"]),
-            page.text(t["kind"].replace("_", " ")),
-            page.number(t["lead_frames"], 0),
-        ]
+        [take["take"], t["frame"], t["kind"].replace("_", " "), Number(t["lead_frames"], 0)]
         for take in runs[0]["takes"]
         for t in take["triggers"]
     ]
-    note = (
-        f'<p class="note">A trigger is right where the body would have fallen within {runs[0]["window_frames"]} frames '
-        "without the reset, which was simulated from the very state of the trigger. Lead: frames from the trigger to "
-        "that fall; negative where the body had fallen already.</p>"
-    )
-    return page.table(header, rows) + note + (page.table(["take", "frame", "kind", "lead"], each) if each else "")
+    return {
+        "failsafe": Table(header, rows),
+        "window_frames": runs[0]["window_frames"],
+        "triggers": Table(["take", "frame", "kind", "lead"], each),
+    }
 
 
-def _takes_table(results: Mapping[str, Any]) -> str:
-    shown = [m for m in METRICS if m.key in ("E_pose", "E_vel", "A_accl", "mpjpe_root_aligned", "root_drift")]
-    ours, *others = results["per_take"]
-    header = [
-        "take",
-        *(f"{m.label}{f' ({m.unit})' if m.unit else ''}, {name}" for m in shown for name in (ours, *others)),
-    ]
+def _takes_table(results: Mapping[str, Any]) -> Table:
+    shown = [m for m in METRICS if m.key in SHOWN]
+    methods = list(results["per_take"])
     rows = []
     for k, take in enumerate(results["takes"]):
-        cells = [page.text(take)]
+        cells = [take]
         for metric in shown:
-            for name in (ours, *others):
+            for name in methods:
                 values = [run[k] for run in results["per_take"][name][metric.key] if run[k] is not None]
-                cells.append(page.number(float(np.mean(values)) if values else None, metric.decimals))
-        rows.append([*cells, page.number(float(np.mean([run[k] for run in results["resets_per_take"]])), 1)])
-    return page.table([*header, "resets"], rows)
+                cells.append(Number(float(np.mean(values)) if values else None, metric.decimals))
+        rows.append([*cells, Number(float(np.mean([run[k] for run in results["resets_per_take"]])), 1)])
+    return Table(["take", *(f"{labelled(m)}, {name}" for m in shown for name in methods), "resets"], rows)
 
 
-def _over_time(takes: Sequence[TakeMotions], settings: ReportSettings) -> str:
-    fps = takes[0].reference.fps
-    errors = [
-        (take.joint_errors(take.estimate).mean(1), take.joint_errors(take.pose_regression).mean(1)) for take in takes
-    ]
+def _over_time(take: TakeMotions) -> tuple[Array, Array]:
+    """``[T]`` mm each: mean over joints, of ours and of PoseReg."""
+    return take.joint_errors(take.estimate).mean(1), take.joint_errors(take.pose_regression).mean(1)
+
+
+def _mean_error(takes: Sequence[TakeMotions]) -> Chart:
+    errors = [_over_time(take) for take in takes]
     longest = max(len(ours) for ours, _ in errors)
-    means = [_mean_over([pair[k] for pair in errors], longest) for k in (0, 1)]
-    seconds = np.arange(longest) / fps
-    label = "MPJPE, roots aligned (mm)"
-    parts = [
-        "<h3>Mean over takes</h3>",
-        charts.line_chart([Line("ours", seconds, means[0]), Line("PoseReg", seconds, means[1])], "s", label),
-    ]
-    for take, (ours, theirs) in list(zip(takes, errors, strict=True))[: settings.takes]:
-        seconds = np.arange(len(ours)) / fps
-        resets = seconds[take.columns["reset"] > 0] if "reset" in take.columns else seconds[:0]
-        said = f" (dashed: {len(resets)} reset{'s' if len(resets) > 1 else ''})" if len(resets) else ""
-        parts.append(f"<h3>{escape(take.name)}{said}</h3>")
-        lines = [Line("ours", seconds, ours), Line("PoseReg", seconds, theirs)]
-        parts.append(charts.line_chart(lines, "s", label, resets))
-        if "confidence" in take.columns:
-            lines = [Line("V over its running mean", seconds, take.columns["confidence"])]
-            parts.append(charts.line_chart(lines, "s", "confidence", resets))
-    return "".join(parts)
+    seconds = np.arange(longest) / takes[0].reference.fps
+    ours, theirs = (_mean_over([pair[k] for pair in errors], longest) for k in (0, 1))
+    return line_chart([Line("ours", seconds, ours), Line("PoseReg", seconds, theirs)], "s", _DISTANCE)
 
 
-def _by_joint(takes: Sequence[TakeMotions]) -> str:
+def _curves(take: TakeMotions) -> dict[str, Any]:
+    """Error over a take and the fail-safe's confidence; resets are marked."""
+    ours, theirs = _over_time(take)
+    seconds = np.arange(len(ours)) / take.reference.fps
+    resets = seconds[take.columns["reset"] > 0] if "reset" in take.columns else seconds[:0]
+    lines = [Line("ours", seconds, ours), Line("PoseReg", seconds, theirs)]
+    charts = [line_chart(lines, "s", _DISTANCE, resets)]
+    if "confidence" in take.columns:
+        lines = [Line("V over its running mean", seconds, take.columns["confidence"])]
+        charts.append(line_chart(lines, "s", "confidence", resets))
+    return {"name": take.name, "resets": len(resets), "charts": charts}
+
+
+def _by_joint(takes: Sequence[TakeMotions]) -> dict[str, Any]:
     names = takes[0].reference.skeleton.names
     motions = {"ours": "estimate", "PoseReg": "pose_regression"}
     means = {
         label: np.mean([take.joint_errors(getattr(take, field)).mean(axis=0) for take in takes], axis=0)
         for label, field in motions.items()
     }
-    rows = [[page.text(n), *(page.number(float(v[k]), 1) for v in means.values())] for k, n in enumerate(names)]
-    chart = charts.bar_chart(names[1:], {label: v[1:] for label, v in means.items()}, "distance, roots aligned (mm)")
-    return chart + page.table(["joint (mm)", *means], rows)
+    return joint_errors(names, means)
+
+
+def joint_errors(
+    names: Sequence[str], means: Mapping[str, Array], order: Sequence[str] | None = None
+) -> dict[str, Any]:
+    """Chart and table of the error by joint.
+
+    Args:
+        names: of the ``J`` joints, the root first; it has no bar, for roots are aligned.
+        means: by method, ``[J]`` mm.
+        order: see :func:`~egopose.evaluation.charts.bar_chart`.
+    """
+    chart = bar_chart(names[1:], {m: v[1:] for m, v in means.items()}, "distance, roots aligned (mm)", order)
+    rows = [[name, *(Number(float(v[k]), 1) for v in means.values())] for k, name in enumerate(names)]
+    return {"joint_chart": chart, "joints": Table(["joint (mm)", *means], rows)}
 
 
 def worst_and_best(takes: Sequence[TakeMotions], count: int, apart: float) -> tuple[list[tuple[int, int]], ...]:
@@ -279,25 +278,32 @@ def worst_and_best(takes: Sequence[TakeMotions], count: int, apart: float) -> tu
     return tuple(out)
 
 
-def _moments(takes: Sequence[TakeMotions], humanoid: HumanoidModel | None, settings: ReportSettings) -> str:
-    if humanoid is None:
-        return '<p class="note">No pictures: the run\'s humanoid is not at hand.</p>'
-    if any(take.reference.skeleton != humanoid.skeleton for take in takes):
-        return '<p class="note">No pictures: the motions are on another humanoid than the run\'s.</p>'
+def _moments(takes: Sequence[TakeMotions], humanoid: HumanoidModel | None, settings: ReportSettings) -> dict[str, Any]:
+    if why := no_pictures([take.reference for take in takes], humanoid):
+        return {"moments": {}, "why_no_moments": why}
+    assert humanoid is not None
     worst, best = worst_and_best(takes, settings.moments, settings.apart)
     places = [*worst, *best]
     poses = [np.stack([getattr(takes[k], part).qpos[t] for k, t in places]) for part in ("reference", "estimate")]
     try:
         frames = list(side_view_frames(humanoid.mj_model, poses, ["reference", "estimate"], settings.size))
     except RuntimeError as error:
-        return f'<p class="note">No pictures: {escape(str(error))}</p>'
+        return {"moments": {}, "why_no_moments": str(error)}
     captions = []
     for k, t in places:
         away = float(takes[k].joint_errors(takes[k].estimate)[t].mean())
         captions.append(f"{takes[k].name}, {t / takes[k].reference.fps:.2f} s (frame {t}): {away:.0f} mm")
-    figures = [page.picture(frame, caption) for frame, caption in zip(frames, captions, strict=True)]
-    parts = (("Worst", figures[: len(worst)]), ("Best", figures[len(worst) :]))
-    return "".join(f'<h3>{name}</h3><div class="moments">{"".join(result)}</div>' for name, result in parts)
+    pictures = [Picture(frame, caption) for frame, caption in zip(frames, captions, strict=True)]
+    return {"moments": {"Worst": pictures[: len(worst)], "Best": pictures[len(worst) :]}, "why_no_moments": None}
+
+
+def no_pictures(motions: Sequence[Motion], humanoid: HumanoidModel | None) -> str | None:
+    """Why ``motions`` cannot be drawn as ``humanoid``, or None."""
+    if humanoid is None:
+        return "the run's humanoid is not at hand."
+    if any(motion.skeleton != humanoid.skeleton for motion in motions):
+        return "the motions are on another humanoid than the run's."
+    return None
 
 
 def _mean_over(curves: Sequence[Array], length: int) -> Array:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from html import escape
 from pathlib import Path
 from typing import Any
 
@@ -16,11 +15,11 @@ import numpy as np
 
 from egopose.core.errors import InputError
 from egopose.core.safe_io import read_json
-from egopose.evaluation import charts, page
-from egopose.evaluation.charts import Line
-from egopose.evaluation.estimation_page import ReportSettings, root_aligned_errors
+from egopose.evaluation.charts import Chart, Line, line_chart
+from egopose.evaluation.estimation_page import ReportSettings, joint_errors, no_pictures, root_aligned_errors
 from egopose.evaluation.forecast_metrics import METRICS
 from egopose.evaluation.forecast_report import FUTURE_COLOUR, TRUTH_COLOUR, other_file
+from egopose.evaluation.page import DAMAGED, Number, Picture, Table, render, result_cell
 from egopose.humanoid.model import HumanoidModel
 from egopose.inference.outputs import RENDERED_NOTE
 from egopose.motion.io import read_motion
@@ -72,18 +71,23 @@ def write_forecast_page(folder: Path, humanoid: HumanoidModel | None, settings: 
         methods = list(results["figures"])
         windows = read_windows(folder, methods)
         errors = {m: np.stack([w.joint_errors(m) for w in windows]) for m in windows[0].told}
-        sections = [
-            ("What was evaluated", _about(results)),
-            ("Figures", _figures(results)),
-            ("Error over the horizon", _over_horizon(results)),
-            ("Error at each moment of the future", _over_time(errors, windows[0].truth.fps, methods)),
-            ("Bands of the joint angles", _coverage(results, windows[0].truth.fps)),
-            ("Error by joint", _by_joint(errors, windows[0].truth.skeleton.names, methods)),
-            ("Best and worst windows", _pictures(windows, next(iter(errors.values())), humanoid, settings)),
-        ]
-    except (KeyError, TypeError, AttributeError, IndexError, ValueError) as error:
+        fps, names = windows[0].truth.fps, windows[0].truth.skeleton.names
+        html = render(
+            "forecast.html",
+            title=f"Forecasts: {results.get('split', '')}",
+            data=results,
+            **_about(results),
+            figures=_figures(results),
+            over_horizon={metric: _over_horizon(results, metric) for metric in METRICS},
+            over_time=_over_time(errors, fps, methods),
+            spread=f"{_SPREAD[1] - _SPREAD[0]:.0%}",
+            coverage=_coverage(results, fps),
+            **joint_errors(names, {m: e.mean(axis=(0, 1)) for m, e in errors.items()}, methods),
+            **_pictures(windows, next(iter(errors.values())), humanoid, settings),
+        )
+    except (*DAMAGED, ValueError) as error:
         raise InputError(folder / "results.json", "figures", f"is damaged: {error!r}") from None
-    out.write_text(page.page(f"Forecasts: {results.get('split', '')}", sections, results), encoding="utf-8")
+    out.write_text(html, encoding="utf-8")
     return out
 
 
@@ -115,67 +119,60 @@ def read_windows(folder: Path, methods: Sequence[str]) -> list[WindowMotions]:
     return result
 
 
-def _about(results: Mapping[str, Any]) -> str:
-    lines = [f"<p>{escape(note)}</p>" for note in results.get("notes", []) if note != RENDERED_NOTE]
-    if results.get("rendered_video"):
-        lines.append(f"<p><strong>{escape(RENDERED_NOTE)}</strong></p>")
-    lines += [f"<p>Checkpoint: <code>{escape(str(c))}</code></p>" for c in results.get("checkpoints", [])]
-    if command := results.get("command"):
-        lines.append(f"<p>Made by</p><pre>{escape(str(command))}</pre>")
-    return "".join(lines)
+def _about(results: Mapping[str, Any]) -> dict[str, Any]:
+    return {
+        "notes": [note for note in results.get("notes", []) if note != RENDERED_NOTE],
+        "rendered_note": RENDERED_NOTE if results.get("rendered_video") else None,
+        "checkpoints": results.get("checkpoints", []),
+        "command": results.get("command"),
+        "level": results.get("settings", {}).get("interval", {}).get("level"),
+    }
 
 
-def _figures(results: Mapping[str, Any]) -> str:
+def _figures(results: Mapping[str, Any]) -> Table:
     methods, divided, ours = list(results["figures"]), list(results["ratios"]), results["divided"]
-    header = ["metric", "up to", *methods, *(f"{ours} / {m}" for m in divided)]
-    rows = []
+    rows: list[list[Any]] = []
     for metric in METRICS:
-        label = f"{metric} ({_UNITS[metric]})" if _UNITS[metric] else metric
         for r, horizon in enumerate(results["horizons_s"]):
             result = [results["figures"][m][metric][r] for m in methods]
             result += [results["ratios"][m][metric][r] for m in divided]
             if any(f is not None for f in result):
-                rows.append([page.text(label), page.text(f"{horizon:.2f} s"), *(_cell(f) for f in result)])
-    level = results.get("settings", {}).get("interval", {}).get("level")
-    said = f"{100 * level:g} % intervals" if isinstance(level, float) else "Intervals"
-    return page.table(header, rows) + f'<p class="note">{said} over runs and takes, by bootstrap.</p>'
+                rows.append([_with_unit(metric), f"{horizon:.2f} s", *(_cell(f) for f in result)])
+    return Table(["metric", "up to", *methods, *(f"{ours} / {m}" for m in divided)], rows)
 
 
-def _cell(found: Mapping[str, Any] | None) -> str:
-    if found is None:
-        return page.number(None)
+def _cell(found: Mapping[str, Any] | None) -> Number:
+    cell = result_cell(found, 3)
     # Of one run and one take the bootstrap draws the same mean again and again: no interval.
-    known = found["low"] is not None and found["low"] < found["high"]
-    return page.number(found["value"], 3, (found["low"], found["high"]) if known else None)
+    return cell if cell.interval is None or cell.interval[0] < cell.interval[1] else Number(cell.value)
 
 
-def _over_horizon(results: Mapping[str, Any]) -> str:
-    """A chart a metric: the mean up to each horizon, a line a method, its interval as ground."""
-    parts = []
-    for metric in METRICS:
-        lines = []
-        for method, figures in results["figures"].items():
-            at = [(h, f) for h, f in zip(results["horizons_s"], figures[metric], strict=True) if f is not None]
-            band = [[np.nan if f[edge] is None else f[edge] for _, f in at] for edge in ("low", "high")]
-            lines.append(Line(method, [h for h, _ in at], [f["value"] for _, f in at], band))
-        shown = f"{metric} ({_UNITS[metric]})" if _UNITS[metric] else metric
-        parts.append(f"<h3>{escape(metric)}</h3>{charts.line_chart(lines, 'mean up to (s)', shown)}")
-    return "".join(parts) + '<p class="note">Ground: the intervals of the table; there are none of a single take.</p>'
+def _with_unit(metric: str) -> str:
+    return f"{metric} ({_UNITS[metric]})" if _UNITS[metric] else metric
 
 
-def _over_time(errors: Mapping[str, Array], fps: float, order: Sequence[str]) -> str:
+def _over_horizon(results: Mapping[str, Any], metric: str) -> Chart:
+    """The mean up to each horizon, a line a method, its interval as ground."""
+    lines = []
+    for method, figures in results["figures"].items():
+        at = [(h, f) for h, f in zip(results["horizons_s"], figures[metric], strict=True) if f is not None]
+        band = [[np.nan if f[edge] is None else f[edge] for _, f in at] for edge in ("low", "high")]
+        lines.append(Line(method, [h for h, _ in at], [f["value"] for _, f in at], band))
+    return line_chart(lines, "mean up to (s)", _with_unit(metric))
+
+
+def _over_time(errors: Mapping[str, Array], fps: float, order: Sequence[str]) -> Chart:
     """Mean over windows at each frame; about ours the middle 80 % of the windows."""
     lines = []
     for k, (method, result) in enumerate(errors.items()):
         curves = result.mean(axis=2)
         band = np.quantile(curves, _SPREAD, axis=0) if k == 0 else None
         lines.append(Line(method, np.arange(1, curves.shape[1] + 1) / fps, curves.mean(axis=0), band))
-    note = f'<p class="note">First run. Ground: the middle {_SPREAD[1] - _SPREAD[0]:.0%} of the windows of ours.</p>'
-    return charts.line_chart(lines, "s into the future", _DISTANCE, order=order) + note
+    return line_chart(lines, "s into the future", _DISTANCE, order=order)
 
 
-def _coverage(results: Mapping[str, Any], fps: float) -> str:
-    """How many true angles lie in the bands, frame by frame, beside how many should."""
+def _coverage(results: Mapping[str, Any], fps: float) -> Chart | None:
+    """How many true angles lie in the bands, frame by frame, beside how many should; None where there are no bands."""
     lines: list[Line] = []
     for run, result in enumerate(results.get("coverage", [])):
         inside = np.asarray(result["held_out_per_frame"], dtype=np.float64)
@@ -183,43 +180,31 @@ def _coverage(results: Mapping[str, Any], fps: float) -> str:
         if not lines:
             lines.append(Line("asked for", seconds, np.full(len(inside), float(result["level"]))))
         lines.append(Line(f"run {run}", seconds, inside))
-    if not lines:
-        return '<p class="note">No bands: no futures were drawn (forecast.samples=1).</p>'
-    return charts.line_chart(lines, "s into the future", "share of true joint angles inside")
-
-
-def _by_joint(errors: Mapping[str, Array], names: Sequence[str], order: Sequence[str]) -> str:
-    means = {method: result.mean(axis=(0, 1)) for method, result in errors.items()}
-    rows = [[page.text(n), *(page.number(float(v[k]), 1) for v in means.values())] for k, n in enumerate(names)]
-    chart = charts.bar_chart(names[1:], {m: v[1:] for m, v in means.items()}, "distance, roots aligned (mm)", order)
-    return chart + page.table(["joint (mm)", *means], rows)
+    return line_chart(lines, "s into the future", "share of true joint angles inside") if lines else None
 
 
 def _pictures(
     windows: Sequence[WindowMotions], errors: Array, humanoid: HumanoidModel | None, settings: ReportSettings
-) -> str:
+) -> dict[str, Any]:
     """Strips of the worst and the best windows by the mean error ``errors [W, H, J]`` of ours."""
-    if humanoid is None:
-        return '<p class="note">No pictures: the run\'s humanoid is not at hand.</p>'
-    if any(window.truth.skeleton != humanoid.skeleton for window in windows):
-        return '<p class="note">No pictures: the motions are on another humanoid than the run\'s.</p>'
+    if why := no_pictures([window.truth for window in windows], humanoid):
+        return {"windows": {}, "why_no_windows": why}
+    assert humanoid is not None
     means = errors.mean(axis=(1, 2))
     order = [int(w) for w in np.argsort(-means)]
     count = min(settings.moments, max(1, len(order) // 2))
-    parts = [
-        "<p>The mean future solid, the true motion green, drawn futures blue; from left to right a third, two thirds "
-        "and the end of the horizon.</p>"
-    ]
+    groups = {"Worst": order[:count], "Best": order[count:][::-1][:count]}
     try:
-        for title, chosen in (("Worst", order[:count]), ("Best", order[count:][::-1][:count])):
-            figures = []
-            for w in chosen:
-                strip = _strip(windows[w], humanoid, settings.size)
-                figures.append(page.picture(strip, f"{windows[w].name}: {means[w]:.0f} mm"))
-            parts.append(f'<h3>{title}</h3><div class="moments">{"".join(figures)}</div>')
+        strips = {
+            title: [
+                Picture(_strip(windows[w], humanoid, settings.size), f"{windows[w].name}: {means[w]:.0f} mm")
+                for w in chosen
+            ]
+            for title, chosen in groups.items()
+        }
     except RuntimeError as error:
-        return f'<p class="note">No pictures: {escape(str(error))}</p>'
-    return "".join(parts)
+        return {"windows": {}, "why_no_windows": str(error)}
+    return {"windows": strips, "why_no_windows": None}
 
 
 def _strip(window: WindowMotions, humanoid: HumanoidModel, size: int) -> Any:

@@ -1,88 +1,97 @@
-"""The parts of a self-contained HTML page: nothing in it comes from elsewhere, and no script runs."""
+"""Self-contained HTML pages from the templates beside this file: nothing comes from elsewhere, and no script runs."""
 
 from __future__ import annotations
 
 import base64
-import json
 import math
 from collections.abc import Mapping, Sequence
-from html import escape
+from dataclasses import dataclass
+from functools import cache
 from typing import Any
 
 import cv2
+import jinja2
 
+from egopose.evaluation.protocols import Metric
 from egopose.vision.video import Frame
 
-#: The browser itself is told to fetch nothing.
-_POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"
-
-_STYLE = """
-:root{color-scheme:light dark}
-body{font:15px/1.5 system-ui,sans-serif;max-width:62rem;margin:2rem auto;padding:0 1rem}
-h1{font-size:1.6rem}h2{font-size:1.2rem;margin-top:2.2rem}h3{font-size:1rem}
-table{border-collapse:collapse;display:block;overflow-x:auto}
-th,td{padding:.15rem .7rem;border-bottom:1px solid #8884;text-align:right;white-space:nowrap}
-th:first-child,td:first-child{text-align:left}
-td small{color:#888}
-pre{background:#8881;padding:.6rem;overflow-x:auto;white-space:pre-wrap}
-svg{width:100%;height:auto;font-size:12px;fill:currentColor}
-svg .tick{font-size:11px}svg .axis{stroke:currentColor}svg .grid{stroke:#8883}
-svg .mark{stroke:#888;stroke-dasharray:3 3}svg .line{fill:none;stroke-width:1.6}
-.legend span{margin-right:1.2rem}.legend i{display:inline-block;width:.8rem;height:.8rem;margin-right:.35rem}
-.moments{display:flex;flex-wrap:wrap;gap:1rem}.moments figure{margin:0}.moments img{max-width:100%}
-figcaption{font-size:.85rem}
-.note{color:#888}
-"""
+#: What reading a damaged results.json into a page raises.
+DAMAGED = (KeyError, TypeError, AttributeError, IndexError, jinja2.UndefinedError)
 
 
-def page(title: str, sections: Sequence[tuple[str, str]], data: Mapping[str, Any]) -> str:
-    """The whole document.
+@dataclass(frozen=True)
+class Number:
+    """A cell of a table: a figure and its interval. ``data-value`` of the page's cell holds it in full."""
+
+    value: float | None
+    decimals: int = 3
+    interval: tuple[float, float] | None = None
+
+    @property
+    def known(self) -> bool:
+        return self.value is not None and math.isfinite(self.value)
+
+    def said(self, value: float) -> str:
+        return f"{value:.{self.decimals}f}"
+
+
+@dataclass(frozen=True)
+class Table:
+    """Rows of cells, each a :class:`Number` or plain text, under a header of plain text."""
+
+    header: Sequence[str]
+    rows: Sequence[Sequence[Any]]
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A picture ``[H, W, 3]`` (RGB) and what is said of it."""
+
+    frame: Frame
+    caption: str
+
+    @property
+    def png(self) -> str:
+        """As base64."""
+        made, png = cv2.imencode(".png", cv2.cvtColor(self.frame, cv2.COLOR_RGB2BGR))
+        if not made:
+            raise RuntimeError("OpenCV made no PNG")
+        return base64.b64encode(png.tobytes()).decode()
+
+
+def render(template: str, **values: Any) -> str:
+    """The page of a template.
 
     Args:
-        title: plain text.
-        sections: heading (plain text) and content (HTML).
-        data: JSON-like values that go along, under the id ``data``, for programs that read the page.
+        template: its name.
+        values: what it shows. All text is escaped; ``data``, JSON-like, goes along under the id ``data`` for programs
+            that read the page.
     """
-    body = "".join(f"<section><h2>{escape(heading)}</h2>{content}</section>\n" for heading, content in sections)
-    # "</" would end the element; JSON knows the same slash escaped.
-    held = json.dumps(data, allow_nan=False).replace("</", "<\\/")
-    return (
-        f'<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">'
-        f'<meta http-equiv="Content-Security-Policy" content="{_POLICY}">'
-        f'<meta name="viewport" content="width=device-width, initial-scale=1">'
-        f"<title>{escape(title)}</title><style>{_STYLE}</style></head>\n"
-        f"<body><h1>{escape(title)}</h1>\n{body}"
-        f'<script type="application/json" id="data">{held}</script></body></html>\n'
+    return _templates().get_template(template).render(values)
+
+
+def result_cell(found: Mapping[str, Any] | None, decimals: int) -> Number:
+    """Of a figure of ``results.json``: ``{value, low, high}``, the ends None where there is no interval."""
+    if not found:
+        return Number(None)
+    between = None if found.get("low") is None else (found["low"], found["high"])
+    return Number(found["value"], decimals, between)
+
+
+def labelled(metric: Metric) -> str:
+    """The metric's label with its unit, where it has one."""
+    return f"{metric.label} ({metric.unit})" if metric.unit else metric.label
+
+
+@cache
+def _templates() -> jinja2.Environment:
+    environment = jinja2.Environment(
+        loader=jinja2.PackageLoader("egopose.evaluation"),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
     )
-
-
-def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """A table of cells that are HTML (see :func:`number`, :func:`text`); the header is plain text."""
-    head = "".join(f"<th>{escape(name)}</th>" for name in header)
-    body = "".join(f"<tr>{''.join(cells)}</tr>" for cells in rows)
-    return f"<table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>"
-
-
-def text(value: object) -> str:
-    """A cell of plain text."""
-    return f"<td>{escape(str(value))}</td>"
-
-
-def number(value: float | None, decimals: int = 3, interval: tuple[float, float] | None = None) -> str:
-    """A cell of a figure with its interval; ``data-value`` holds it in full."""
-    if value is None or not math.isfinite(value):
-        return "<td>-</td>"
-    said = f"{value:.{decimals}f}"
-    if interval is not None:
-        said += f" <small>[{interval[0]:.{decimals}f}, {interval[1]:.{decimals}f}]</small>"
-    return f'<td data-value="{value!r}">{said}</td>'
-
-
-def picture(frame: Frame, caption: str) -> str:
-    """A figure whose picture ``[H, W, 3]`` (RGB) stands in the page as PNG."""
-    made, png = cv2.imencode(".png", cv2.cvtColor(frame, cv2.COLOR_RGB2BGR))
-    if not made:
-        raise RuntimeError("OpenCV made no PNG")
-    source = base64.b64encode(png.tobytes()).decode()
-    said = escape(caption)
-    return f'<figure><img alt="{said}" src="data:image/png;base64,{source}"><figcaption>{said}</figcaption></figure>'
+    environment.policies["json.dumps_kwargs"] = {"allow_nan": False}
+    environment.tests["number"] = lambda cell: isinstance(cell, Number)
+    return environment

@@ -6,7 +6,6 @@ import csv
 import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from html import escape
 from pathlib import Path
 from typing import Any
 
@@ -15,8 +14,9 @@ import numpy as np
 from egopose.core.errors import InputError
 from egopose.core.former_names import upgraded
 from egopose.core.safe_io import read_json, read_yaml
-from egopose.evaluation import charts, page
-from egopose.evaluation.charts import Line
+from egopose.evaluation.charts import Chart, Line, line_chart
+from egopose.evaluation.estimation_page import SHOWN
+from egopose.evaluation.page import Number, Table, labelled, render, result_cell
 from egopose.evaluation.protocols import METRICS
 from egopose.motion.rotations import Array
 
@@ -63,13 +63,18 @@ def write_sweep_report(folder: Path, settings: SweepSettings, out: Path) -> Path
     figures = {
         job.name: {"settings": {k: job.settings.get(k) for k in changed}, **_figures(job, settings)} for job in jobs
     }
-    sections = [
-        ("What was swept", _about(folder, jobs)),
-        ("Jobs", _jobs_table(jobs, changed, figures, settings)),
-        *([("Evaluations", _evaluations(jobs))] if any(job.evaluations for job in jobs) else []),
-        ("Curves", _curves(jobs, changed, settings)),
-    ]
-    out.write_text(page.page(f"Sweep: {folder.resolve().name}", sections, figures), encoding="utf-8")
+    html = render(
+        "sweep.html",
+        title=f"Sweep: {folder.resolve().name}",
+        data=figures,
+        finished=sum(job.finished for job in jobs),
+        command=_command(folder),
+        jobs=_jobs_table(jobs, changed, figures, settings),
+        last=settings.last,
+        evaluations=_evaluations(jobs) if any(job.evaluations for job in jobs) else None,
+        curves=_curves(jobs, changed, settings),
+    )
+    out.write_text(html, encoding="utf-8")
     return out
 
 
@@ -130,58 +135,49 @@ def _last(column: Array | None, count: int) -> float | None:
     return float(finite[-count:].mean()) if len(finite) else None
 
 
-def _about(folder: Path, jobs: Sequence[Job]) -> str:
-    ended = sum(job.finished for job in jobs)
-    lines = [f"<p>{len(jobs)} jobs, {ended} finished.</p>"]
+def _command(folder: Path) -> str | None:
+    """What made the sweep; None where Hydra left no record."""
     swept = folder / "multirun.yaml"
-    if swept.is_file():
-        overrides = (read_yaml(swept, "hydra").get("hydra") or {}).get("overrides") or {}
-        words = [str(w) for part in ("hydra", "task") for w in overrides.get(part) or []]
-        words = [word for word in words if not word.startswith("hydra.mode=")]
-        command = shlex.join(["python", "-m", "egopose.train", "--multirun", *words])
-        lines.append(f"<p>Made by</p><pre>{escape(command)}</pre>")
-    return "".join(lines)
+    if not swept.is_file():
+        return None
+    overrides = (read_yaml(swept, "hydra").get("hydra") or {}).get("overrides") or {}
+    words = [str(w) for part in ("hydra", "task") for w in overrides.get(part) or []]
+    words = [word for word in words if not word.startswith("hydra.mode=")]
+    return shlex.join(["python", "-m", "egopose.train", "--multirun", *words])
 
 
 def _jobs_table(
     jobs: Sequence[Job], changed: Sequence[str], figures: Mapping[str, Mapping[str, Any]], settings: SweepSettings
-) -> str:
+) -> Table:
     shown = [name for name in settings.curves if any(figures[job.name][name] is not None for job in jobs)]
     rows = [
         [
-            page.text(job.name),
-            *(page.text(job.settings.get(name, "-")) for name in changed),
-            page.number(figures[job.name][_STEPS], 0),
-            *(page.number(figures[job.name][name]) for name in shown),
-            page.text("yes" if job.finished else "no"),
+            job.name,
+            *(job.settings.get(name, "-") for name in changed),
+            Number(figures[job.name][_STEPS], 0),
+            *(Number(figures[job.name][name]) for name in shown),
+            "yes" if job.finished else "no",
         ]
         for job in jobs
     ]
-    note = f'<p class="note">Figures are means of the last {settings.last} iterations that have one.</p>'
-    return page.table(["job", *changed, _STEPS, *shown, "finished"], rows) + note
+    return Table(["job", *changed, _STEPS, *shown, "finished"], rows)
 
 
-def _evaluations(jobs: Sequence[Job]) -> str:
+def _evaluations(jobs: Sequence[Job]) -> Table:
     """A row a job and split: what ``egopose evaluate`` found."""
-    shown = [m for m in METRICS if m.key in ("E_pose", "E_vel", "A_accl", "mpjpe_root_aligned", "root_drift")]
+    shown = [m for m in METRICS if m.key in SHOWN]
     rows = []
     for job in jobs:
         for split, results in job.evaluations.items():
-            figures = results.get("figures", {})
-            if not figures:
-                continue
-            ours = next(iter(figures.values()))
-            cells = []
-            for metric in shown:
-                result = ours.get(metric.key)
-                between = (result["low"], result["high"]) if result and result.get("low") is not None else None
-                cells.append(page.number(result["value"] if result else None, metric.decimals, between))
-            rows.append([page.text(job.name), page.text(split), *cells])
-    return page.table(["job", "split", *(f"{m.label}{f' ({m.unit})' if m.unit else ''}" for m in shown)], rows)
+            if figures := results.get("figures", {}):
+                ours = next(iter(figures.values()))
+                rows.append([job.name, split, *(result_cell(ours.get(m.key), m.decimals) for m in shown)])
+    return Table(["job", "split", *map(labelled, shown)], rows)
 
 
-def _curves(jobs: Sequence[Job], changed: Sequence[str], settings: SweepSettings) -> str:
-    parts = []
+def _curves(jobs: Sequence[Job], changed: Sequence[str], settings: SweepSettings) -> dict[str, Chart]:
+    """By column of ``curves.csv``: a line a job, where any has figures."""
+    charts = {}
     for name in settings.curves:
         lines = []
         for job in jobs:
@@ -190,7 +186,6 @@ def _curves(jobs: Sequence[Job], changed: Sequence[str], settings: SweepSettings
             there = np.isfinite(job.curves[name])
             differs = ", ".join(f"{key.rsplit('.', 1)[-1]}={job.settings.get(key)}" for key in changed[:4])
             lines.append(Line(f"{job.name}: {differs}", job.curves[_STEPS][there], job.curves[name][there]))
-        lines = [line for line in lines if len(np.asarray(line.x))]
-        if lines:
-            parts.append(f"<h3>{escape(name)}</h3>{charts.line_chart(lines, 'control steps', name)}")
-    return "".join(parts)
+        if lines := [line for line in lines if len(np.asarray(line.x))]:
+            charts[name] = line_chart(lines, "control steps", name)
+    return charts

@@ -7,6 +7,7 @@ Networks with a memory learn from whole sequences ``[T]``, each begun with the h
 
 from __future__ import annotations
 
+import math
 from collections import defaultdict
 from dataclasses import dataclass, fields
 from typing import Any
@@ -16,7 +17,7 @@ from tensordict import TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule
 from torch import Tensor
 from torchrl.modules import set_recurrent_mode
-from torchrl.objectives import ClipPPOLoss
+from torchrl.objectives import ClipPPOLoss, KLAdaptiveLR
 from torchrl.objectives.value import GAE
 
 from egopose.core.config import from_mapping
@@ -45,8 +46,8 @@ class PPOSettings:
         policy_grad_norm: the actor's gradient is scaled down to this norm.
         value_grad_norm: the same for the critic; None for no limit.
         normalize_advantage: to zero mean and unit deviation over the batch.
-        target_kl: after each epoch the actor's step size is adapted to keep KL(old || new), over the rows of one
-            minibatch, near this; None to keep it.
+        target_kl: after each epoch TorchRL's KLAdaptiveLR adapts the actor's step size to keep KL(old || new), over the
+            rows of one minibatch, near this; None to keep it.
         policy_lr_range: bounds of the adapted step size.
         smoothness: weight of the mean action's squared distance (summed over actions, rad^2) from the mean of those a
             step before and after it; 0 for none.
@@ -90,6 +91,11 @@ class PPOSettings:
         for name in ("epochs", "max_nonfinite"):
             if getattr(self, name) < 1:
                 raise InputError(source, name, f"must be at least 1, not {getattr(self, name)}")
+        if self.target_kl is not None and self.target_kl <= 0:
+            raise InputError(source, "target_kl", f"must be positive or null, not {self.target_kl}")
+        low, high = self.policy_lr_range
+        if not 0 < low <= high:
+            raise InputError(source, "policy_lr_range", f"must be two positive numbers in order, not {[low, high]}")
         if self.minibatch_size is not None and self.minibatch_size < 2:
             raise InputError(source, "minibatch_size", f"must be null or at least 2, not {self.minibatch_size}")
 
@@ -116,6 +122,8 @@ class PPO:
             entropy_coeff=settings.entropy_coeff if settings.entropy_coeff > 0 else None,
             critic_coeff=1.0,
             loss_critic_type="l2",
+            # Its own is of each minibatch while the critic moves; `update` takes one of the whole batch before.
+            log_explained_variance=False,
         )
         # Without a network it reads the values that `_values` has written.
         self.gae = GAE(gamma=settings.gamma, lmbda=settings.lmbda, value_network=None)
@@ -126,6 +134,11 @@ class PPO:
             raise ValueError("actor and critic share parameters; each needs its own")
         self.policy_optimizer = torch.optim.Adam(self.policy_parameters, lr=settings.policy_lr)
         self.value_optimizer = torch.optim.Adam(self.value_parameters, lr=settings.value_lr)
+        # Its only state is the step size, which the optimiser's own state holds.
+        self.step_size: KLAdaptiveLR | None = None
+        if settings.target_kl is not None:
+            low, high = settings.policy_lr_range
+            self.step_size = KLAdaptiveLR(self.policy_optimizer, settings.target_kl, min_lr=low, max_lr=high)
         self._nonfinite_in_a_row = 0
 
     @torch.no_grad()
@@ -183,11 +196,13 @@ class PPO:
                     continue
                 for name, value in figures.items():
                     sums[name].append(value)
-            if self.settings.target_kl is not None or epoch == self.settings.epochs - 1:
+            if self.step_size is not None or epoch == self.settings.epochs - 1:
                 # A fresh draw of rows every epoch, and a quarter of the cost of all at four minibatches.
                 first = minibatches[0]
                 kl = self.divergence(rows if first is None else rows[first])
-                self._adapt_step_size(kl)
+                # TorchRL raises where it is not finite. One that overflowed is too large; NaN is `_gradient_step`'s.
+                if self.step_size is not None and not math.isnan(kl):
+                    self.step_size.step(min(kl, torch.finfo(torch.float32).max))
         out = {name: float(torch.stack(values).mean()) for name, values in sums.items()}
         return out | {
             "kl": kl,
@@ -270,18 +285,6 @@ class PPO:
             return torch.zeros(())
         mean = self.actor.get_dist(rows.select(*self.actor.in_keys)).mean
         return (mean - rows["smooth_loc"]).square().sum(dim=-1).mean()
-
-    def _adapt_step_size(self, kl: float) -> None:
-        """The actor's step size follows the divergence (Rudin et al. 2022, "Learning to walk in minutes")."""
-        target = self.settings.target_kl
-        if target is None:
-            return
-        low, high = self.settings.policy_lr_range
-        for group in self.policy_optimizer.param_groups:
-            if kl > 2 * target:
-                group["lr"] = max(low, group["lr"] / 1.5)
-            elif kl < target / 2:
-                group["lr"] = min(high, group["lr"] * 1.5)
 
 
 def _between_neighbours(loc: Tensor, done: Tensor) -> Tensor:
