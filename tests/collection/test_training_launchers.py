@@ -45,8 +45,8 @@ def sweep(folder: Path, launcher: str, *more: str) -> list[list]:
 
 def test_joblib_runs_a_sweep_in_processes_of_its_own(tmp_path: Path) -> None:
     pytest.importorskip("hydra_plugins.hydra_joblib_launcher", reason="needs pip install 'egopose[sweep]'")
-    jobs = sweep(tmp_path, "local", "collector=multi_async")
-    assert [job[:2] for job in jobs] == [[1, "multi_async"], [2, "multi_async"]]
+    jobs = sweep(tmp_path, "local", "collector=multi_sync")
+    assert [job[:2] for job in jobs] == [[1, "multi_sync"], [2, "multi_sync"]]
     assert os.getpid() not in {job[2] for job in jobs}
 
 

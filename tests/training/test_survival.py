@@ -58,13 +58,13 @@ def test_killed_at_random_moments_it_ends_as_if_left_alone(rounds: int, capsys: 
 
 @linux
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", ["multi_sync", "multi_async", pytest.param("ray", marks=needs_ray)])
+@pytest.mark.parametrize("kind", ["multi_sync", pytest.param("ray", marks=needs_ray)])
 def test_with_workers_nothing_is_lost_or_left(kind: str, capsys: pytest.CaptureFixture[str]) -> None:
     result = killed(capsys, 3, f"collector={kind}", "collector.num_envs=2")
     assert (result["kills"], result["orphans"], result["iterations"]) == (3, 0, 15)
     assert (result["loaded_equal"], result["curves_whole"]) == (True, True)
     assert result["most_lost"] <= 2  # a checkpoint every second iteration
-    assert (result["bit_equal"], result["curves_equal"]) == ((None, None) if kind == "multi_async" else (True, True))
+    assert (result["bit_equal"], result["curves_equal"]) == (True, True)
 
 
 # --- checkpoints -----------------------------------------------------------------------------------------------------
@@ -254,17 +254,16 @@ def slow(worker):
     return TransformedEnv(Slow(2))
 
 if __name__ == "__main__":
-    settings = CollectorSettings.from_config({{**COLLECTOR, "kind": {kind!r}, "workers": 2}})
+    settings = CollectorSettings.from_config({{**COLLECTOR, "kind": "multi_sync", "workers": 2}})
     next(iter(build_collector(settings, slow, networks()[0], 8)))
 """
 
 
 @linux
-@pytest.mark.parametrize("kind", ["multi_sync", pytest.param("multi_async", marks=pytest.mark.slow)])
-def test_a_killed_learner_leaves_no_workers(kind: str, tmp_path: Path) -> None:
+def test_a_killed_learner_leaves_no_workers(tmp_path: Path) -> None:
     """Not even such as are in the middle of a step that takes ten minutes."""
     program = tmp_path / "program.py"
-    program.write_text(LONG_STEP.format(tests=str(Path(__file__).parents[1]), kind=kind))
+    program.write_text(LONG_STEP.format(tests=str(Path(__file__).parents[1])))
     with subprocess.Popen([sys.executable, str(program)], stdout=subprocess.PIPE, text=True) as learner:
         assert learner.stdout is not None
         try:
@@ -463,7 +462,7 @@ def test_one_process_trains_in_a_run_directory(tmp_path: Path) -> None:
 
 @linux
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", ["multi_sync", "multi_async", pytest.param("ray", marks=needs_ray)])
+@pytest.mark.parametrize("kind", ["multi_sync", pytest.param("ray", marks=needs_ray)])
 def test_ctrl_c_at_a_terminal_saves_whatever_collects(
     kind: str, launcher: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

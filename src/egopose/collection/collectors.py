@@ -31,7 +31,7 @@ __all__ = [
     "transform_state",
 ]
 
-KINDS = ("sync", "multi_sync", "multi_async", "ray")
+KINDS = ("sync", "multi_sync", "ray")
 
 
 @dataclass(frozen=True)
@@ -39,8 +39,8 @@ class CollectorSettings:
     """See ``conf/collector``.
 
     Args:
-        kind: ``sync`` in this process; ``multi_sync`` and ``multi_async`` in processes, ``ray`` on machines of a Ray
-            cluster: see :class:`egopose.collection.workers.Workers`.
+        kind: ``sync`` in this process; ``multi_sync`` in processes, ``ray`` on machines of a Ray cluster: see
+            :class:`egopose.collection.workers.Workers`.
         num_envs: of one environment.
         physics_threads: of one environment.
         workers: processes, each with an environment of its own.
