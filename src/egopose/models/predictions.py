@@ -65,28 +65,3 @@ def predict_takes(
             for key, table in tables.items():
                 table[span.start : span.stop] = outputs[key]
     return tables
-
-
-def regression_error(model: StateRegressor, predicted: Tensor, targets: Tensor) -> dict[str, float]:
-    """Mean squared errors in normalised units, and those of predicting the training mean for the same frames.
-
-    Args:
-        model: whose statistics define the units.
-        predicted: ``[N, S]`` states z.
-        targets: ``[N, S]``.
-
-    Returns:
-        ``mse`` and ``mean_mse``, over all numbers of the state, and both by part: ``root_pose``, ``joint_angles``,
-        ``root_velocity``, ``joint_velocities``.
-    """
-    wanted = model.normalise(targets)
-    error, spread = (model.normalise(predicted) - wanted).square(), wanted.square()
-    dofs = (targets.shape[-1] - 11) // 2
-    ends = np.cumsum([0, 5, dofs, 6, dofs])
-    out = {"mse": error.mean().item(), "mean_mse": spread.mean().item()}
-    for part, a, b in zip(
-        ("root_pose", "joint_angles", "root_velocity", "joint_velocities"), ends[:-1], ends[1:], strict=True
-    ):
-        out[f"mse_{part}"] = error[:, a:b].mean().item()
-        out[f"mean_mse_{part}"] = spread[:, a:b].mean().item()
-    return out
