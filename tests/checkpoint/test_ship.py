@@ -21,11 +21,12 @@ from torchrl.checkpoint import Checkpoint
 from egopose.checkpoint import pretrained as weights
 from egopose.checkpoint.checkpoint import find_checkpoint, read_json
 from egopose.checkpoint.checksums import seal
-from egopose.checkpoint.package import ship
+from egopose.checkpoint.package import package_run
 from egopose.core.config import compose_config
 from egopose.core.errors import InputError
 from egopose.data.preparation import humanoid_of
 from egopose.evaluation.options import data_at, output_folder
+from egopose.evaluation.package_figures import describe_run
 from egopose.inference.video import estimate_video
 from egopose.inference.video_regression import seen_in, video_dataset
 from egopose.pipeline.agent import _other_store
@@ -39,7 +40,7 @@ LARGEST = 20e6  # bytes of all that ships
 
 
 def settings(run: Path, out: Path, **changed: Any) -> dict[str, Any]:
-    return {**compose_config("ship", [f"run={run}", "name=mine"]), "out": str(out), **changed}
+    return {**compose_config("package", [f"run={run}", "name=mine"]), "out": str(out), **changed}
 
 
 @pytest.fixture(scope="module")
@@ -65,7 +66,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def shipped(run: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return ship(settings(run, tmp_path_factory.mktemp("shipped") / "mine"))
+    return package_run(settings(run, tmp_path_factory.mktemp("shipped") / "mine"), describe_run)
 
 
 def test_only_what_using_them_takes_is_shipped(run: Path, shipped: Path) -> None:
@@ -129,10 +130,10 @@ def test_a_path_that_was_overlooked_is_refused(run: Path, tmp_path: Path) -> Non
     value.write_text(json.dumps({**config, "extra": {"file": "/home/me/secret"}}))
     seal(made)
     with pytest.raises(InputError, match="extra\\.file"):
-        ship(settings(copy, tmp_path / "out"))
+        package_run(settings(copy, tmp_path / "out"), describe_run)
     assert not (tmp_path / "out").exists()
     with pytest.raises(InputError, match="name"):
-        ship(settings(run, tmp_path / "out", name="../up"))
+        package_run(settings(run, tmp_path / "out", name="../up"), describe_run)
 
 
 def test_figures_are_means_with_intervals_and_the_first_is_divided(run: Path, tmp_path: Path) -> None:
@@ -141,7 +142,7 @@ def test_figures_are_means_with_intervals_and_the_first_is_divided(run: Path, tm
         raw = {"takes": ["a", "b"], "figures": {"E_pose": [scale, 3 * scale]}, "resets": [1, 0], "frames": [600, 300]}
         raws[method] = str(tmp_path / f"{method}.json")
         Path(raws[method]).write_text(json.dumps(raw))
-    out = ship(settings(run, tmp_path / "out", figures=raws))
+    out = package_run(settings(run, tmp_path / "out", figures=raws), describe_run)
     about = json.loads((out / weights.ABOUT).read_text())
     assert about["figures"]["ours"]["E_pose"] == {"value": 2.0, "low": 1.0, "high": 3.0}
     assert about["figures"]["ours"]["resets_per_minute"] == pytest.approx(2.0)
@@ -194,7 +195,7 @@ def test_git_ignores_none_of_them() -> None:
 
 
 def test_help_of_the_verb(tmp_path: Path) -> None:
-    command = [sys.executable, "-m", "egopose.ship", f"run={tmp_path}", "name=mine"]
+    command = [sys.executable, "-m", "egopose.package", f"run={tmp_path}", "name=mine"]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 2
     assert "checkpoints: is missing" in done.stderr

@@ -15,10 +15,17 @@ from egopose.core.config import compose_config
 from egopose.core.errors import InputError
 from egopose.data.preparation import prepare
 from egopose.data.store import TakeStore
-from egopose.data.sync_offset import find_offset, head_turning, settings_of, sync_offset, unexplained, video_turning
+from egopose.data.sync_offset import (
+    find_offset,
+    head_turning,
+    run_sync,
+    settings_of,
+    sync_offset,
+    unexplained,
+    video_turning,
+)
 from egopose.motion.io import read_motion, write_motion
 from egopose.motion.motion import Motion
-from egopose.sync import run_sync
 from egopose.vision.camera_rotation import camera_rotation
 from egopose.vision.flow import FlowConfig
 from egopose.vision.lens import Camera

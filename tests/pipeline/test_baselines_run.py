@@ -12,7 +12,6 @@ import pytest
 import torch
 from test_material import configuration, fill_flow
 
-from egopose.baseline import run_baseline_job
 from egopose.core.config import compose_config
 from egopose.core.errors import InputError
 from egopose.data import preparation
@@ -22,7 +21,13 @@ from egopose.data.windows import forecast_windows
 from egopose.models.baselines.path_pose import PathPose
 from egopose.models.baselines.recurrent import RecurrentForecaster
 from egopose.pipeline.agent import load_agent
-from egopose.pipeline.baselines import forecast_qpos, load_baseline, path_pose_motion, regressed_motion
+from egopose.pipeline.baselines import (
+    forecast_qpos,
+    load_baseline,
+    path_pose_motion,
+    regressed_motion,
+    run_baseline_job,
+)
 from egopose.pipeline.dataset import load_dataset
 from egopose.pipeline.run import build_run
 from egopose.training.loop import train

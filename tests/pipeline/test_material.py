@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import fcntl
 import json
 import logging
@@ -17,7 +18,6 @@ import pytest
 import torch
 from mocap import short_clips
 
-from egopose import dataset
 from egopose.checkpoint.checkpoint import RunCheckpoint, find_checkpoint, metadata_of
 from egopose.core.config import compose_config
 from egopose.core.errors import InputError
@@ -180,7 +180,7 @@ def test_a_run_does_not_go_on_with_another_store(made: Path, no_videos: None, tm
     found.keep_provenance(tmp_path)
     found.keep_provenance(tmp_path)
     with pytest.raises(InputError, match="store_fingerprint"):
-        dataset.replace(found, store_fingerprint="0" * 64).keep_provenance(tmp_path)
+        dataclasses.replace(found, store_fingerprint="0" * 64).keep_provenance(tmp_path)
 
 
 # --- fingerprints see code -------------------------------------------------------------------------------------------
