@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
@@ -132,6 +133,17 @@ def score_take(
 def fragment_names(takes: Sequence[str], fragments: Sequence[FragmentLike]) -> list[str]:
     """``TAKE_START-STOP`` of each, by which its figures are known; ``takes`` are the names of all takes."""
     return [f"{takes[f.take]}_{f.start}-{f.stop}" for f in fragments]
+
+
+def raw_figures(scores: Sequence[TakeScores]) -> dict[str, Any]:
+    """A method's raw result: ``takes``, ``figures[metric][take]`` in the units of :data:`METRICS`, ``resets[take]``,
+    ``frames[take]``."""
+    return {
+        "takes": [one.name for one in scores],
+        "figures": {m.key: [m.scale * one.figure(m.key) for one in scores] for m in METRICS},
+        "resets": [one.resets for one in scores],
+        "frames": [len(one.frames["E_pose"]) for one in scores],
+    }
 
 
 @dataclass(frozen=True)
