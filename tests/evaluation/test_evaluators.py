@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import pickle
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +15,8 @@ from torchrl.render import RenderConfig, render_policy
 
 from egopose.checkpoint.checkpoint import find_checkpoint
 from egopose.core.errors import InputError
-from egopose.evaluation.torchrl_evaluator import checkpoint_evaluator
+from egopose.evaluation import torchrl_evaluator
+from egopose.evaluation.torchrl_evaluator import _checkpoint_env, _checkpoint_policy, _Trained, checkpoint_evaluator
 from egopose.evaluation.torchrl_render import make_env, make_policy
 from egopose.pipeline.agent import load_agent
 from egopose.pipeline.run import build_run
@@ -48,6 +51,28 @@ def survived(folder: Path, dataset: Dataset) -> tuple[float, float]:
     agent = load_agent(folder, dataset, which="latest")
     found = frames_survived(agent.make_env("test", num_envs=WORLDS), agent.actor, SEED)
     return found.mean, float(found.fell.double().mean())
+
+
+def test_one_evaluator_loads_its_checkpoint_once(
+    estimating: tuple[Path, Dataset], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    loaded = []
+    monkeypatch.setattr(torchrl_evaluator, "load_agent", lambda *args: loaded.append(args) or load_agent(*args))
+    folder, dataset = estimating
+    evaluator = checkpoint_evaluator(folder, which="latest", num_envs=WORLDS, seed=SEED, dataset=dataset)
+    try:
+        evaluator.evaluate()
+    finally:
+        evaluator.shutdown()
+    assert len(loaded) == 1
+
+
+def test_what_makes_environment_and_policy_shares_an_agent_where_it_is_sent(estimating: tuple[Path, Dataset]) -> None:
+    here = _Trained.of(*estimating, token="first")
+    first, second = (pickle.dumps(partial(make, here)) for make in (_checkpoint_env, _checkpoint_policy))
+    del here  # as in another process
+    made = [pickle.loads(each) for each in (first, second)]
+    assert made[0].args[0] is made[1].args[0]
 
 
 def same_figures(folder: Path, dataset: Dataset, backend: str) -> None:
