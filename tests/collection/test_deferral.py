@@ -166,7 +166,7 @@ def test_a_state_from_before_rewards_were_deferred_goes_on() -> None:
     next(batches)
     simulation, transforms = simulation_state(first), transform_state(first)
     old = {**simulation["carrier"], "reward_terms.pose": torch.zeros(WORLDS, 1)}
-    simulation = {"carrier": old, "num_envs": simulation["num_envs"]}
+    simulation = {"carrier": old, "worlds": simulation["worlds"]}
     again = iter(second)
     load_transform_state(second, {key: value.clone() for key, value in transforms.items()})
     load_simulation_state(second, simulation)

@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import json
+import os
+import pickle
 import shutil
+import sys
 from dataclasses import replace
 from importlib.resources import files
 from itertools import pairwise
+from multiprocessing.reduction import ForkingPickler
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +21,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from mocap import SHORT_CLIPS, short_clips
 
+from egopose.benchmarks.process_memory import mapped_mb
 from egopose.core.config import compose_config
 from egopose.core.errors import InputError
 from egopose.data import preparation
@@ -182,10 +187,8 @@ def own(tmp_path: Path) -> dict[str, Any]:
 def test_own_videos_are_taken_as_they_are_and_resumed_take_by_take(
     own: dict[str, Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from egopose.vision import features
-
     calls: list[Path] = []
-    real = features.extract_flow
+    real = preparation.extract_flow
 
     def stops_at_the_second(path: Path, *arguments: object) -> np.ndarray:
         calls.append(path)
@@ -193,7 +196,7 @@ def test_own_videos_are_taken_as_they_are_and_resumed_take_by_take(
             raise KeyboardInterrupt
         return real(path, *arguments)
 
-    monkeypatch.setattr(features, "extract_flow", stops_at_the_second)
+    monkeypatch.setattr(preparation, "extract_flow", stops_at_the_second)
     with pytest.raises(KeyboardInterrupt):
         prepare(own, progress=False)
     name = flow_name(own)
@@ -315,6 +318,95 @@ def test_a_missing_table_is_named(store: TakeStore) -> None:
         store.table("light")
     with pytest.raises(InputError, match="tables/light"):
         store.table_card("light")
+
+
+# --- what is read stays as it was made --------------------------------------------------------------------------------
+
+
+def with_table(store: TakeStore) -> TakeStore:
+    store.write_table("light", {"x": torch.arange(store.frames_total * 2.0).reshape(-1, 2)}, {"epoch": 1})
+    return store
+
+
+def test_a_change_in_place_stays_in_memory(store: TakeStore) -> None:
+    with_table(store)
+    before = {file: file.read_bytes() for file in store.root.rglob("*.memmap")}
+    assert len(before) == 7
+    reference, table = store.reference, store.table("light")
+    kept = store.reference["qpos"].clone()
+    reference["qpos"] += 1.0
+    reference["qvel"][3:5] = 0.0
+    table["x"].zero_()
+    assert torch.equal(reference["qpos"], kept + 1.0)
+    assert {file: file.read_bytes() for file in before} == before
+    assert torch.equal(TakeStore.open(store.root).reference["qpos"], kept)
+    assert TakeStore.open(store.root).table("light")["x"][1].tolist() == [2.0, 3.0]
+
+
+def test_flow_is_filled_on_the_disk_and_read_like_all_else(store: TakeStore) -> None:
+    table = store.open_flow("light", 4)
+    table[store.frames(1)] = 2.0
+    for take in (0, 1):
+        store.mark_flow("light", take)
+    read = TakeStore.open(store.root).flow("light")
+    assert (read[store.frames(0)] == 0).all()
+    assert (read[store.frames(1)] == 2).all()
+    read.zero_()
+    assert (TakeStore.open(store.root).flow("light")[store.frames(1)] == 2).all()
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
+def test_another_process_maps_the_file_and_gets_no_copy(store: TakeStore) -> None:
+    """What a worker is sent is the file's name, of a part of a tensor too; its pages are shared."""
+    file = store.root / "reference" / "xpos.memmap"
+    tensor = store.reference["xpos"]
+    for sent in (tensor, tensor[3:5], tensor[:, 2], *tensor.chunk(2), store.reference[4:9]["xpos"]):
+        message = bytes(ForkingPickler.dumps(sent))
+        assert len(message) < 1000
+        received = pickle.loads(message)
+        assert torch.equal(received, sent)
+        resident, altered = mapped_mb(os.getpid(), file)
+        assert resident > 0
+        assert altered == 0
+        received += 1.0
+        assert torch.equal(store.reference["xpos"], tensor)
+
+
+@pytest.mark.parametrize("part", ["reference/qpos.memmap", "clips/{take}.motion.npz", "tables/light/x.memmap"])
+def test_an_altered_file_is_refused(store: TakeStore, part: str) -> None:
+    with_table(store)
+    name = part.format(take=store.takes[0].name)
+
+    def read() -> None:
+        again = TakeStore.open(store.root)
+        again.reference, again.clip(0), again.table("light")
+
+    read()
+    data = bytearray((store.root / name).read_bytes())
+    data[len(data) // 2] ^= 1
+    (store.root / name).write_bytes(bytes(data))
+    with pytest.raises(InputError, match=r"was altered since it was made: delete .*, and it is made anew") as caught:
+        read()
+    assert caught.value.field == name
+
+
+def test_a_store_from_before_there_were_checksums_opens(store: TakeStore) -> None:
+    path, content = card(with_table(store))
+    assert len(content.pop("checksums")) == 9
+    path.write_text(json.dumps(content))
+    (store.root / "tables/light/checksums.json").unlink()
+    again = TakeStore.open(store.root)
+    assert torch.equal(again.reference["qpos"], store.reference["qpos"])
+    assert len(again.clip(0)) == store.takes[0].length
+    assert again.table("light")["x"].shape == (store.frames_total, 2)
+
+
+@pytest.mark.parametrize("checksums", [[1], {"reference/qpos.memmap": 3}, {"../else": "0" * 64}])
+def test_damaged_checksums_are_named(store: TakeStore, checksums: Any) -> None:
+    path, content = card(store)
+    path.write_text(json.dumps({**content, "checksums": checksums}))
+    with pytest.raises(InputError, match=r"store\.json: checksums: is damaged"):
+        TakeStore.open(store.root)
 
 
 # --- splits ----------------------------------------------------------------------------------------------------------
