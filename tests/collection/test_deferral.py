@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 
@@ -9,7 +10,7 @@ import pytest
 import torch
 from env_stand_in import environment
 from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModule, TensorDictModuleBase
+from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequential
 from torch import Tensor, nn
 from torchrl.collectors import Collector
 from torchrl.envs import check_env_specs
@@ -17,6 +18,7 @@ from torchrl.modules import IndependentNormal, ProbabilisticActor
 
 from egopose.collection.collectors import (
     CollectorSettings,
+    SlowPolicyWarning,
     build_collector,
     load_simulation_state,
     load_transform_state,
@@ -24,7 +26,9 @@ from egopose.collection.collectors import (
     transform_state,
 )
 from egopose.collection.stepping import TransformedEgoPoseEnv
+from egopose.envs.forecasting_transforms import RecurrentStates
 from egopose.envs.transforms import StateNormalizer
+from egopose.models.recurrent import hidden_keys, state_memory
 
 WORLDS, STEPS = 5, 20
 SETTINGS = CollectorSettings("sync", num_envs=WORLDS, physics_threads=1, workers=1, threads=1, update_threads=1)
@@ -177,3 +181,57 @@ def test_a_state_from_before_rewards_were_deferred_goes_on() -> None:
 
     a, b = go_on(batches), go_on(again)
     assert (a == b).all()
+
+
+class Custom(TensorDictModule):
+    """A module of a user's own that does what its parent does."""
+
+
+def custom_actor(env: TransformedEgoPoseEnv) -> TensorDictModuleBase:
+    (network, *_) = make_actor(env).module
+    return ProbabilisticActor(
+        Custom(network.module, in_keys=network.in_keys, out_keys=network.out_keys),
+        in_keys=["loc", "scale"],
+        distribution_class=IndependentNormal,
+        return_log_prob=True,
+    )
+
+
+def silent_actor(env: TransformedEgoPoseEnv) -> TensorDictModuleBase:
+    return make_actor(env).module[0]
+
+
+@pytest.mark.parametrize(
+    ("policy", "reason"),
+    [
+        (custom_actor, "its part Custom is no plain TensorDictModule"),
+        (silent_actor, "it is a TensorDictModule and no ProbabilisticActor"),
+    ],
+)
+def test_a_policy_that_loses_the_quick_way_is_told_of(
+    policy: Callable[[TransformedEgoPoseEnv], TensorDictModuleBase], reason: str
+) -> None:
+    with pytest.warns(SlowPolicyWarning, match=reason) as caught:
+        collector = build_collector(SETTINGS, make_env, policy(make_env()), WORLDS * STEPS)
+    collector.shutdown()
+    assert len(caught) == 1
+
+
+@pytest.mark.filterwarnings("error")
+def test_the_usual_policy_is_called_in_the_quick_way() -> None:
+    build_collector(SETTINGS, make_env, make_actor(make_env()), WORLDS * STEPS).shutdown()
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_policy_with_a_memory_is_no_slip() -> None:
+    env = make_env()
+    modules, out = state_memory("policy", "humanoid_state", env.observation_spec["humanoid_state"].shape[-1], 4)
+    head = TensorDictModule(nn.Linear(4, env.action_spec.shape[-1]), in_keys=[out], out_keys=["action"])
+    remembering = partial(with_memory, make_env)
+    build_collector(SETTINGS, remembering, TensorDictSequential(*modules, head), WORLDS * STEPS).shutdown()
+
+
+def with_memory(make: Callable[[int], TransformedEgoPoseEnv], number: int) -> TransformedEgoPoseEnv:
+    env = make(number)
+    env.append_transform(RecurrentStates(dict.fromkeys(hidden_keys("policy"), 4)))
+    return env
