@@ -210,8 +210,8 @@ def test_the_start_policy_asks_for_the_curves_next_pose(dataset: Dataset) -> Non
     actor, critic = build_networks(config, followed, env)
     observation = critic(actor(env.reset()))
     start = observation["episode_start"].squeeze(-1)
-    assert followed.futures is not None
-    following = followed.futures.poses(start, torch.ones_like(start))[:, 5:-6]
+    assert followed.forecasts is not None
+    following = followed.forecasts.poses(start, torch.ones_like(start))[:, 5:-6]
     rest = torch.as_tensor(dataset.humanoid.rest_action).float()
     torch.testing.assert_close(observation["loc"] + rest, following, atol=1e-6, rtol=0)
     # Episodes begin on the curve: nothing to correct.
@@ -235,8 +235,8 @@ def test_what_knows_the_future_is_refused(dataset: Dataset) -> None:
 
 def test_a_forecast_follows_what_its_context_shows_and_nothing_else(dataset: Dataset, tmp_path: Path) -> None:
     followed, config = replace(dataset, forecasts=curves(dataset)), configuration()
-    assert followed.futures is not None
-    size, made = followed.futures.coefficients.shape[-1], settings()
+    assert followed.forecasts is not None
+    size, made = followed.forecasts.coefficients.shape[-1], settings()
     members = nn.ModuleList(
         [build_forecaster(made, torch.zeros(size), torch.ones(size), FPS, seed) for seed in range(made.members)]
     )
@@ -256,7 +256,7 @@ def test_a_forecast_follows_what_its_context_shows_and_nothing_else(dataset: Dat
     with torch.no_grad():
         wanted = torch.stack([member(pasts[..., :size].float()) for member in members]).mean(0)
     now = torch.tensor([w.now for w in windows])
-    first = followed.futures.poses(now, torch.zeros(2, dtype=torch.int64))
+    first = followed.forecasts.poses(now, torch.zeros(2, dtype=torch.int64))
     torch.testing.assert_close(first, wanted[:, 0])
     torch.testing.assert_close(qpos[:, 7:].float(), first[:, 5:-6])
     assert qvel.isfinite().all()
@@ -281,15 +281,15 @@ def test_shipped_forecasters_bring_no_curves_of_training_and_forecast_the_same(
     found = []
     for run in ("run", "shipped"):
         followed = with_forecasts(config, dataset, tmp_path / run)
-        assert followed.futures is not None
-        assert len(followed.futures.starts) == (0 if run == "shipped" else len(known.starts))
+        assert followed.forecasts is not None
+        assert len(followed.forecasts.starts) == (0 if run == "shipped" else len(known.starts))
         path = tmp_path / run / "checkpoints" / "checkpoint-1"
         path.mkdir(parents=True)
         make_env, network = partial(build_env, config, followed), nn.Identity()
         agent = Agent(network, network, config, followed, make_env, path)  # type: ignore[arg-type]
         qpos, qvel = begin_forecasts(agent, windows, pasts)
         now = torch.tensor([windows[0].now])
-        found.append((qpos, qvel, *(followed.futures.poses(now, now * 0 + step) for step in range(12))))
+        found.append((qpos, qvel, *(followed.forecasts.poses(now, now * 0 + step) for step in range(12))))
         make_env(num_envs=1).close()
     assert all(torch.equal(one, other) for one, other in zip(*found, strict=True))
 

@@ -10,12 +10,13 @@ import os
 import shutil
 import subprocess
 import sys
-import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
+from helpers.waiting import wait_until
 from mocap import short_clips
 
 from egopose.checkpoint.checkpoint import RunCheckpoint, find_checkpoint, metadata_of
@@ -202,18 +203,20 @@ def test_the_preparations_version_is_part_of_fingerprint_and_folder(
 # --- one process at a time -------------------------------------------------------------------------------------------
 
 HOLDER = """
-import sys, time
+import sys
 from pathlib import Path
 from egopose.data.lock import store_lock
 with store_lock(Path(sys.argv[1])):
     print("held", flush=True)
-    time.sleep(float(sys.argv[2]))
+    sys.stdin.readline()
 """
 
 
-def hold(root: Path, seconds: float) -> subprocess.Popen[str]:
+def hold(root: Path) -> subprocess.Popen[str]:
+    """A process that holds the store's lock until it is told, or ends."""
     process = subprocess.Popen(
-        [sys.executable, "-c", HOLDER, str(root), str(seconds)],
+        [sys.executable, "-c", HOLDER, str(root)],
+        stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         text=True,
         env=os.environ | {"OMP_NUM_THREADS": "1"},
@@ -224,21 +227,30 @@ def hold(root: Path, seconds: float) -> subprocess.Popen[str]:
 
 
 def test_a_second_preparation_waits_and_says_so(made: Path, capfd: pytest.CaptureFixture[str]) -> None:
-    process = hold(made / "store", 1.0)
-    began = time.monotonic()
-    prepare(configuration(made), progress=False, flow=False)
-    assert time.monotonic() - began > 0.5
-    assert process.wait(10) == 0
-    said = capfd.readouterr().err
-    assert said.count("waiting: another process is at work on the store") == 1
+    process, said = hold(made / "store"), ""
+
+    def waits() -> bool:
+        nonlocal said
+        said += capfd.readouterr().err
+        return "waiting: another process is at work on the store" in said
+
+    with ThreadPoolExecutor() as pool:
+        second = pool.submit(prepare, configuration(made), progress=False, flow=False)
+        wait_until(waits, "the second preparation says that it waits")
+        assert not second.done()
+        process.communicate("end\n")
+        second.result()
+    assert process.returncode == 0
+    said += capfd.readouterr().err
+    assert said.count("waiting") == 1
     prepare(configuration(made), progress=False, flow=False)
     assert "waiting" not in capfd.readouterr().err
 
 
 def test_a_killed_process_holds_nothing(tmp_path: Path) -> None:
-    process = hold(tmp_path / "store", 60)
+    process = hold(tmp_path / "store")
     process.kill()
-    process.wait(10)
+    process.wait()
     with store_lock(tmp_path / "store"):
         pass
 

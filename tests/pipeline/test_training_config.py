@@ -9,12 +9,12 @@ import signal
 import subprocess
 import sys
 import textwrap
-import time
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import pytest
+from helpers.waiting import PATIENCE, wait_until
 from omegaconf import OmegaConf
 
 from egopose.checkpoint.checkpoint import find_checkpoint, read_json, verify
@@ -173,7 +173,7 @@ def start(launcher: Path, cwd: Path, *words: str, **how: Any) -> subprocess.Pope
 
 def command(launcher: Path, cwd: Path, *words: str) -> tuple[int, str, str]:
     process = start(launcher, cwd, *words)
-    out, err = process.communicate(timeout=120)
+    out, err = process.communicate(timeout=PATIENCE)
     return process.returncode, out, err
 
 
@@ -234,12 +234,14 @@ def test_an_unknown_run_is_refused_and_not_made(launcher: Path, tmp_path: Path) 
 def test_signals_save_and_tell_how_to_go_on(number: int, launcher: Path, tmp_path: Path) -> None:
     process = start(launcher, tmp_path, "algo.iterations=100000", "logger=csv")
     curves: list[Path] = []
-    deadline = time.monotonic() + 60
-    while time.monotonic() < deadline and not (curves and len(curves[0].read_text().splitlines()) > 2):
-        time.sleep(0.2)
-        curves = list((tmp_path / "runs").glob("*/curves.csv"))
+
+    def two_iterations() -> bool:
+        curves[:] = (tmp_path / "runs").glob("*/curves.csv")
+        return bool(curves) and len(curves[0].read_text().splitlines()) > 2
+
+    wait_until(two_iterations, "two iterations stand in the curves")
     process.send_signal(number)
-    out, err = process.communicate(timeout=60)
+    out, err = process.communicate(timeout=PATIENCE)
     assert process.returncode == 130, err
     folder = curves[0].parent
     assert f"python -m egopose.train resume={folder}" in out

@@ -17,6 +17,7 @@ from typing import Any
 
 import pytest
 import torch
+from helpers.waiting import PATIENCE
 from test_training_config import command, launcher, start
 from toy_problem import make_run
 
@@ -204,7 +205,7 @@ def test_a_full_disk_ends_the_run_and_leaves_its_checkpoints_whole(tmp_path: Pat
     mount = ["unshare", "-Urm", "sh", "-c", f'mount -t tmpfs -o size=900k none {disk} && exec "$@"', "sh"]
     mounts = shutil.which("unshare") and subprocess.run([*mount, "true"], capture_output=True).returncode == 0
     words = [*mount, *words, str(disk)] if mounts else words
-    done = subprocess.run(words, capture_output=True, text=True, timeout=120)
+    done = subprocess.run(words, capture_output=True, text=True)
     assert done.stdout.split() == ["whole", "2" if mounts else "1"], done.stderr
 
 
@@ -273,7 +274,7 @@ def test_a_killed_learner_leaves_no_workers(tmp_path: Path) -> None:
             assert len(workers) == 2
         finally:  # or a failure would wait ten minutes for the step's end
             learner.kill()
-    assert end_of(workers, 20)[1] == set()
+    assert end_of(workers, PATIENCE)[1] == set()
 
 
 @linux
@@ -476,14 +477,14 @@ def test_ctrl_c_at_a_terminal_saves_whatever_collects(
         assert process.poll() is None
     started = family(process.pid)
     os.killpg(process.pid, signal.SIGINT)
-    out, err = process.communicate(timeout=60)
+    out, err = process.communicate(timeout=PATIENCE)
     assert process.returncode == 130, err
     assert f"python -m egopose.train resume={folder}" in out
     found = checkpoints.recover(folder)
     assert found is not None
     with (folder / "curves.csv").open() as file:
         assert checkpoints.verify(found)["iteration"] == float(list(csv.DictReader(file))[-1]["iteration"])
-    assert end_of(started, 20)[1] == set()
+    assert end_of(started, PATIENCE)[1] == set()
 
 
 @linux
@@ -497,7 +498,7 @@ def test_a_second_ctrl_c_stops_at_once_and_keeps_what_is_saved(launcher: Path, t
     for _ in range(2):
         process.send_signal(signal.SIGINT)
         time.sleep(0.002)
-    out, err = process.communicate(timeout=60)
+    out, err = process.communicate(timeout=PATIENCE)
     assert process.returncode == 130, err
     assert f"python -m egopose.train resume={folder}" in out
     assert checkpoints.recover(folder) is not None

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import logging
-import time
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from hydra import compose, initialize_config_dir
+from torch.utils.flop_counter import FlopCounterMode
 
 from egopose.core.errors import InputError
 from egopose.vision.encoders import FlowEncoder, build_encoder
@@ -65,20 +65,12 @@ def test_speed_and_direction_of_flow_both_get_through(cfg: dict) -> None:
     assert (base - opposite).norm() > 1e-2 * base.norm()
 
 
-def test_light_encoder_is_fast_enough_for_real_time() -> None:
-    """Budget 2 ms a frame on one core (a third of a 30 Hz control step is for everything but the physics)."""
-    encoder = make(LIGHT).eval()
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    flow = torch.randn(1, 2, 32, 32)
-    times = []
-    with torch.inference_mode():
-        for _ in range(50):
-            start = time.perf_counter()
-            encoder(flow)
-            times.append(time.perf_counter() - start)
-    torch.set_num_threads(threads)
-    assert min(times) < 2e-3
+def test_light_encoder_is_small_enough_for_real_time() -> None:
+    """9 million operations a frame, where a core does some 10 thousand million a second: 1 ms of a 30 Hz step's 33."""
+    counter = FlopCounterMode(display=False)
+    with torch.inference_mode(), counter:
+        make(LIGHT).eval()(torch.randn(1, 2, 32, 32))
+    assert 0 < counter.get_total_flops() < 2e7
 
 
 def test_resnet_takes_hub_weights_from_a_folder_and_keeps_their_sum(tmp_path: Path) -> None:
