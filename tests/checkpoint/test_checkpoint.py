@@ -14,10 +14,10 @@ from typing import Any
 
 import pytest
 import torch
+from helpers.toy_problem import CONFIG, make_run
 from torchrl.checkpoint import Checkpoint
 from torchrl.render import load_checkpoint
 from torchrl.render.checkpoint import infer_state_dict
-from toy_problem import CONFIG, make_run
 
 from egopose.checkpoint import checkpoint as checkpoints
 from egopose.checkpoint.checksums import CHECKSUMS, _checksums

@@ -14,7 +14,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from env_stand_in import group
+from helpers.env_stand_in import group
 from hydra import compose, initialize_config_dir
 
 from egopose.core.config import compose_config

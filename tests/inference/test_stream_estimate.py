@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from live_stand_in import untrained, write_walk
-from test_inference_video import run, settings  # noqa: F401  # a fixture
+from helpers.live_stand_in import untrained, write_walk
+from helpers.video_run import run, settings  # noqa: F401  # a fixture
 from torch import nn
 
 from egopose.core.config import compose_config

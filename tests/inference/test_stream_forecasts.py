@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from helpers.live_stand_in import untrained, write_walk
+from helpers.video_run import run  # noqa: F401  # a fixture
 from helpers.waiting import PATIENCE, wait_until
-from live_stand_in import untrained, write_walk
-from test_inference_video import run  # noqa: F401  # a fixture
 
 from egopose.benchmarks import stream as bench
 from egopose.benchmarks.stream import untrained_forecaster

@@ -12,10 +12,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from helpers.live_stand_in import write_walk
 from helpers.waiting import PATIENCE, wait_until
 from hypothesis import given
 from hypothesis import strategies as st
-from live_stand_in import write_walk
 
 from egopose.core.errors import InputError
 from egopose.inference.stream import frame_sources as sources

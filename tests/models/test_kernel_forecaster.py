@@ -11,12 +11,12 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from env_stand_in import group
-from humanoid_stand_in import stand_in
-from test_blended import KERNEL, blended
-from test_continued_forecaster import continued
-from test_material import configuration, fill_flow
-from test_motion_forecast import FPS, SMALL, contexts_of, settings, unmirrored, wave
+from helpers.blended_regressor import KERNEL, blended
+from helpers.continued_forecaster import continued
+from helpers.env_stand_in import group
+from helpers.forecast_curves import FPS, SMALL, contexts_of, settings, unmirrored, wave
+from helpers.humanoid_stand_in import stand_in
+from helpers.small_store import configuration, fill_flow
 from torch import Tensor, nn
 
 from egopose.checkpoint.checkpoint import ComponentState, RunCheckpoint, has_component, metadata_of

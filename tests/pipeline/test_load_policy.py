@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from helpers.estimation_run import configuration, estimation_dataset
 from tensordict import TensorDict
-from test_training_pipeline import configuration, estimation_dataset
 
 from egopose.checkpoint import pretrained as weights
 from egopose.checkpoint.checkpoint import find_checkpoint, read_json

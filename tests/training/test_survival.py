@@ -17,9 +17,9 @@ from typing import Any
 
 import pytest
 import torch
+from helpers.toy_problem import make_run
+from helpers.train_command import command, launcher, start
 from helpers.waiting import PATIENCE
-from test_training_config import command, launcher, start
-from toy_problem import make_run
 
 from egopose import bench
 from egopose.benchmarks.processes import end_of, family
@@ -159,7 +159,7 @@ FULL_DISK = """
 import resource, sys
 from pathlib import Path
 sys.path.insert(0, {tests!r})
-from toy_problem import make_run
+from helpers.toy_problem import make_run
 from egopose.checkpoint.checkpoint import recover, verify
 from egopose.training.logging import build_loggers
 from egopose.training.loop import TrainingStopped, train
@@ -242,7 +242,7 @@ import os, sys, time
 sys.path.insert(0, {tests!r})
 from functools import partial
 from torchrl.envs import TransformedEnv
-from toy_problem import COLLECTOR, ToyEnv, networks
+from helpers.toy_problem import COLLECTOR, ToyEnv, networks
 from egopose.collection.collectors import CollectorSettings, build_collector
 
 class Slow(ToyEnv):

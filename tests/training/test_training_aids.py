@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from env_stand_in import PIECES, environment, group, problem
-from humanoid_stand_in import stand_in
+from helpers.env_stand_in import PIECES, environment, group, problem
+from helpers.estimation_run import assert_equal, configuration, estimation_dataset
+from helpers.humanoid_stand_in import stand_in
 from hypothesis import given
 from hypothesis import strategies as st
-from test_training_pipeline import assert_equal, configuration, estimation_dataset
 
 from egopose.core.config import compose_config
 from egopose.core.errors import InputError

@@ -7,13 +7,13 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
-from humanoid_stand_in import StandIn, reference_motion, stand_in
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
 from egopose.envs.build import build_env, build_problem
 from egopose.envs.env import EgoPoseEnv
 from egopose.envs.problem import ImitationProblem
+from helpers.humanoid_stand_in import StandIn, reference_motion, stand_in
 
 
 class Piece(NamedTuple):
@@ -28,7 +28,7 @@ PIECES = (Piece(0, 0, 40), Piece(1, 5, 25))
 @cache
 def group(name: str, option: str) -> dict[str, Any]:
     """One config file as the mains see it."""
-    with initialize_config_dir(str(Path(__file__).parents[1] / "conf"), version_base="1.3"):
+    with initialize_config_dir(str(Path(__file__).parents[2] / "conf"), version_base="1.3"):
         return dict(OmegaConf.to_container(compose(f"{name}/{option}")[name], resolve=True))
 
 

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from conftest import SHARED
-from mocap import default_humanoid
+from helpers.mocap import default_humanoid
 
 from egopose.core.config import compose_config
 from egopose.data import gate

@@ -9,7 +9,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import pytest
-from humanoid_stand_in import stand_in
+from helpers.humanoid_stand_in import stand_in
 
 from egopose.humanoid.physics import BatchedPhysics, _Worker
 

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers.any_motion import motions
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
@@ -14,7 +15,6 @@ from egopose.motion.io import read_motion, write_motion
 from egopose.motion.io.frames import UNITS, UP_AXES
 from egopose.motion.kinematics import tip_positions
 from egopose.motion.motion import Motion
-from egopose.motion.skeleton import Dof, Joint, Skeleton
 
 
 def distances(a: Motion, b: Motion) -> tuple[float, float]:
@@ -34,25 +34,6 @@ def _tips(motion: Motion) -> tuple[list[tuple[str, int]], np.ndarray]:
     names, points = tip_positions(motion.skeleton, *motion.forward_kinematics())
     numbered = [(n, names[:k].count(n)) for k, n in enumerate(names)]
     return numbered, np.moveaxis(points, -2, 0)
-
-
-@st.composite
-def motions(draw: st.DrawFn) -> Motion:
-    rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
-    count, frames = draw(st.integers(1, 8)), draw(st.integers(1, 6))
-    joints = [Joint("j0", -1, (0, 0, 0), (), ((0.0, 0.0, 0.1),))]
-    for i in range(1, count):
-        dofs = []
-        for _ in range(draw(st.integers(0, 4))):
-            axis = rng.normal(size=3)
-            kind = draw(st.sampled_from(["hinge", "hinge", "hinge", "slide"]))
-            dofs.append(Dof(kind, tuple(axis / np.linalg.norm(axis))))
-        tips = tuple(tuple(rng.normal(size=3) * 0.1) for _ in range(draw(st.integers(0, 2))))
-        joints.append(Joint(f"j{i}", draw(st.integers(0, i - 1)), tuple(rng.normal(size=3)), tuple(dofs), tips))
-    skeleton = Skeleton(tuple(joints))
-    qpos = rng.normal(size=(frames, skeleton.nq)) * draw(st.sampled_from([0.01, 1.0, 3.0]))
-    qpos[:, 3:7] = rot.normalize(rng.normal(size=(frames, 4)))
-    return Motion(skeleton, qpos, draw(st.sampled_from([24.0, 29.97, 30.0, 60.0, 120.0])))
 
 
 @settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])

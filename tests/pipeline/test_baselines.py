@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from test_material import configuration, fill_flow
+from helpers.small_store import configuration, fill_flow
 
 from egopose.core.config import compose_config
 from egopose.core.errors import InputError

@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from test_forecasting_training import configuration as forecasting_configuration
-from test_forecasting_training import forecasting_dataset
-from test_training_pipeline import configuration, estimation_dataset
+from helpers.estimation_run import configuration, estimation_dataset
+from helpers.forecasting_run import configuration as forecasting_configuration
+from helpers.forecasting_run import forecasting_dataset
 from torchrl.render import RenderConfig, render_policy
 
 from egopose.checkpoint.checkpoint import find_checkpoint

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from env_stand_in import PIECES, environment, problem
+from helpers.env_stand_in import PIECES, environment, problem
 from torchrl.envs.libs.dm_control import DMControlWrapper
 from torchrl.envs.utils import check_env_specs
 

@@ -13,12 +13,12 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from helpers.toy_problem import COLLECTOR, LOOP, SETTINGS, ToyEnv, networks
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from tensordict import TensorDictBase
 from torchrl.envs import Compose, RenameTransform, TransformedEnv
-from toy_problem import COLLECTOR, LOOP, SETTINGS, ToyEnv, networks
 
 from egopose.collection import collectors
 from egopose.collection.collectors import CollectorSettings, build_collector
@@ -74,7 +74,8 @@ class Recorder:
 def test_three_iterations_with_workers(kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """One start of the processes, several looks at what they brought."""
     # Ray's workers find this module, whose environment they make, as any other program's: on the path.
-    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parents[1]), prepend=os.pathsep)
+    for folder in Path(__file__).parents[:2]:
+        monkeypatch.setenv("PYTHONPATH", str(folder), prepend=os.pathsep)
     run = make_run(tmp_path, kind)
     try:
         recorder = Recorder(run)

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from test_forecasting_training import CONTEXT, configuration, forecasting_dataset
+from helpers.forecasting_run import CONTEXT, configuration, forecasting_dataset
 
 from egopose.data.windows import ForecastWindow
 from egopose.envs.mdp.observations import humanoid_state

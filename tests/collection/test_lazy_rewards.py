@@ -8,7 +8,7 @@ from functools import partial
 
 import pytest
 import torch
-from env_stand_in import environment
+from helpers.env_stand_in import environment
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequential
 from torch import Tensor, nn

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from mocap import default_humanoid
+from helpers.mocap import default_humanoid
 
 from egopose.core.config import compose_config
 from egopose.core.errors import InputError

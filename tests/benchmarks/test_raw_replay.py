@@ -8,7 +8,7 @@ import sys
 import mujoco
 import numpy as np
 import torch
-from env_stand_in import environment
+from helpers.env_stand_in import environment
 from torchrl.collectors import Collector
 
 from egopose.benchmarks.raw_replay import RawReplay, StepRecorder, compare_with_raw

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from env_stand_in import PIECES, environment, problem
+from helpers.env_stand_in import PIECES, environment, problem
 from tensordict.nn import TensorDictModule
 from torchrl.envs import Compose, TransformedEnv
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from env_stand_in import Piece, group
+from helpers.env_stand_in import Piece, group
 
 from egopose.core.errors import InputError
 from egopose.data.reference import reference_states

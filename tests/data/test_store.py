@@ -17,9 +17,9 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from helpers.mocap import SHORT_CLIPS, short_clips
 from hypothesis import given
 from hypothesis import strategies as st
-from mocap import SHORT_CLIPS, short_clips
 
 from egopose.benchmarks.process_memory import mapped_mb
 from egopose.core.config import compose_config

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 import torch
 import yaml
-from mocap import default_humanoid
+from helpers.mocap import default_humanoid
 from tensordict import TensorDict
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.objectives import ClipPPOLoss

@@ -16,11 +16,10 @@ from typing import Any
 
 import pytest
 import torch
+from helpers.small_store import configuration, fill_flow
 from helpers.waiting import wait_until
-from mocap import short_clips
 
 from egopose.checkpoint.checkpoint import RunCheckpoint, find_checkpoint, metadata_of
-from egopose.core.config import compose_config
 from egopose.core.errors import InputError
 from egopose.data import preparation
 from egopose.data.lock import store_lock
@@ -32,44 +31,6 @@ from egopose.pipeline.dataset import load_dataset, run_dataset
 from egopose.pipeline.regressor import kept_tables, load_regressor, regressor_name, regressor_tables
 from egopose.pipeline.run import build_run
 from egopose.training.loop import train
-
-
-def configuration(folder: Path) -> dict[str, Any]:
-    """Two short embedded clips, the quick simulation, a small flow and small networks."""
-    return compose_config(
-        "train",
-        [
-            *short_clips(folder),
-            "data.split.train_share=0.5",
-            "data.split.shortest=8",
-            "vision.flow.stored_size=8",
-            "vision.encoder.input_size=8",
-            "vision.encoder.features=6",
-            "vision.encoder.channels=[4]",
-            "regressor.hidden=[8]",
-            "regressor.context_size=4",
-            "regressor.epochs=4",
-            "regressor.save_every=1",
-            "model.hidden=[8]",
-            "collector=sync",
-            "collector.num_envs=2",
-            "collector.physics_threads=1",
-            "algo.steps_per_iteration=8",
-            "algo.iterations=1",
-            "algo.minibatch_size=8",
-            "seed=3",
-        ],
-    )
-
-
-def fill_flow(config: dict[str, Any]) -> None:
-    """Noise in place of rendered video's flow, noted as done."""
-    store = TakeStore.open(store_folder(config))
-    name, generator = flow_name(config), torch.Generator().manual_seed(0)
-    flow = store.open_flow(name, int(config["vision"]["flow"]["stored_size"]))
-    flow.copy_(0.05 * torch.randn(flow.shape, generator=generator))
-    for take in range(len(store.takes)):
-        store.mark_flow(name, take)
 
 
 @pytest.fixture(scope="module")

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from env_stand_in import Piece, group
+from helpers.env_stand_in import Piece, group
 
 from egopose.core.errors import InputError
 from egopose.data.reference import reference_states

@@ -8,12 +8,12 @@ from typing import Any
 
 import numpy as np
 import torch
-from env_stand_in import group
 
 from egopose.benchmarks.stream import untrained_on
 from egopose.data.preparation import humanoid_of
 from egopose.inference.stream.build import Trained
 from egopose.vision.video import write_video
+from helpers.env_stand_in import group
 
 
 @cache

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import torch
-from env_stand_in import environment, problem
+from helpers.env_stand_in import environment, problem
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays

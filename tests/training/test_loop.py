@@ -11,8 +11,8 @@ from typing import Any
 
 import pytest
 import torch
+from helpers.toy_problem import SETTINGS, make_env, make_run, networks
 from tensordict import TensorDict
-from toy_problem import SETTINGS, make_env, make_run, networks
 
 from egopose.core.errors import InputError
 from egopose.training.logging import CsvCurves, ProgressLine, build_loggers, git_state

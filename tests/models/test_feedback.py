@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 import torch
 import yaml
-from mocap import default_humanoid
+from helpers.mocap import default_humanoid
 from tensordict import TensorDict
 
 from egopose.core.config import from_mapping
