@@ -22,15 +22,18 @@ NOTEBOOK = "notebooks/first_look.ipynb"
 
 #: Rooms of the package and the modules of each whose public names others build on.
 API = {
-    "motion": "motion rotations skeleton kinematics mapping retarget contacts ground settle io",
+    "motion": "motion rotations skeleton kinematics mapping retarget contacts ground io",
     "humanoid": "config model from_motion physics",
-    "vision": "video flow lens turning features encoders rendering rooms takes limbs limb_pictures",
-    "data": "sources preparation prepare_motion sync store splits feasibility gate",
-    "envs": "build problem env task starts transforms mdp.observations mdp.rewards mdp.terminations",
-    "models": "policy context episode_context regressor pose_regression mirror",
-    "training": "loop ppo collectors supervised limb_finder predictions checkpoint",
+    "vision": "video flow lens camera_rotation features encoders rendering rooms takes body_parts body_part_pictures",
+    "data": "take_sources preparation prepare_motion sync_offset store splits feasibility gate",
+    "models": "policy context episode_context regressor pose_regression predictions mirror",
+    "envs": "build problem env dm_control_task starts transforms mdp.observations mdp.rewards mdp.terminations",
+    "collection": "collectors",
+    "checkpoint": "checkpoint body_parts",
+    "training": "loop ppo regressor body_parts survival",
+    "pipeline": "agent dataset environment",
     "inference": "estimator failsafe forecaster bands",
-    "evaluation": "metrics position_metrics protocols statistics survival agents",
+    "evaluation": "metrics position_metrics protocols statistics agents",
 }
 
 

@@ -19,7 +19,7 @@ from egopose.data.gate import LEAD
 from egopose.data.preparation import humanoid_of
 from egopose.data.prepare_motion import reference_motion
 from egopose.data.reference import reference_states
-from egopose.data.sync import head_turning
+from egopose.data.sync_offset import head_turning
 from egopose.humanoid.model import HumanoidModel
 from egopose.humanoid.physics import BatchedPhysics
 from egopose.motion.io import read_motion

@@ -25,7 +25,7 @@ from egopose.core.errors import InputError
 
 HERE = Path(__file__).resolve().parent
 sys.path.insert(0, str(HERE))
-import readers
+import readers  # noqa: E402
 
 SHARES = {
     **{"bvh": 0.15, "acclaim": 0.1, "deepmimic": 0.1, "native": 0.1, "amass": 0.1},

@@ -7,7 +7,6 @@ Reads ``measured.json`` beside this file, which ``python -m egopose.bench scalin
 from __future__ import annotations
 
 import argparse
-import heapq
 import json
 from dataclasses import dataclass
 from pathlib import Path
@@ -84,42 +83,17 @@ def in_step(cost: dict[str, Any], plan: Plan, faster: float = 1.0) -> tuple[floa
     return plan.frames / whole, {name: part / whole for name, part in parts.items()}
 
 
-def out_of_step(cost: dict[str, Any], plan: Plan, cores: int, faster: float = 1.0) -> tuple[float, dict[str, float]]:
-    """Steps/s where workers collect on during the update; an iteration takes the first pieces to come in."""
-    rng = np.random.default_rng(0)
-    learner = sum(learner_parts(cost, plan, faster).values())
-    # Where there are fewer cores than workers and learner, the work of both is spread over the longer one's time.
-    piece = float(collect_seconds(cost, plan, rng, 1)[0])
-    slower = max(1.0, (plan.workers * piece + learner) / (cores * max(piece, learner)))
-    ready = [(float(t) * slower, w) for w, t in enumerate(collect_seconds(cost, plan, rng, plan.workers))]
-    heapq.heapify(ready)
-    now, waited = 0.0, 0.0
-    for _ in range(ITERATIONS):
-        for _ in range(plan.workers):
-            done, worker = heapq.heappop(ready)
-            waited += max(0.0, done - now)
-            now = max(now, done)
-            again = float(collect_seconds(cost, plan, rng, 1)[0]) * slower
-            heapq.heappush(ready, (now + again, worker))
-        now += learner * slower
-    busy = learner_parts(cost, plan, faster)
-    shares = {name: part * ITERATIONS / now for name, part in busy.items()}
-    return ITERATIONS * plan.frames / now, {"collect": waited / now, **shares}
-
-
 def curves(cost: dict[str, Any]) -> dict[str, list[tuple[int, Plan, float, dict[str, float]]]]:
     """Every way of dividing the work, over the number of cores."""
     out: dict[str, list[tuple[int, Plan, float, dict[str, float]]]] = {}
     for cores in CORES:
-        rest = max(1, cores - 1)
         ways = {
-            "in step, same batch": (same_batch(cost, cores), in_step, {}),
-            "in step, growing batch": (growing_batch(cost, cores), in_step, {}),
-            "out of step, growing batch": (growing_batch(cost, rest), out_of_step, {"cores": cores}),
-            "in step, growing batch, update 20 times as quick": (growing_batch(cost, cores), in_step, {"faster": 20.0}),
+            "same batch": (same_batch(cost, cores), 1.0),
+            "growing batch": (growing_batch(cost, cores), 1.0),
+            "growing batch, update 20 times as quick": (growing_batch(cost, cores), 20.0),
         }
-        for name, (plan, run, options) in ways.items():
-            rate, shares = run(cost, plan, **options)
+        for name, (plan, faster) in ways.items():
+            rate, shares = in_step(cost, plan, faster)
             out.setdefault(name, []).append((cores, plan, rate, shares))
     return out
 
@@ -130,9 +104,7 @@ def check(cost: dict[str, Any]) -> list[str]:
     for name in sorted(key for key in cost if key.startswith("measured_")):
         kind, workers = name.removeprefix("measured_").rsplit("_", 1)
         plan = same_batch(cost, int(workers))
-        if kind == "multi_async":
-            predicted, _ = out_of_step(cost, plan, cores=2)
-        elif kind == "sync":  # nothing is sent
+        if kind == "sync":  # nothing is sent
             alone = {**cost, "join_s": 0.0, "exchange_s": 0.0, "weights_s": 0.0}
             predicted, _ = in_step(alone, plan)
         else:

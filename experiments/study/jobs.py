@@ -12,7 +12,6 @@ from typing import Any
 import torch
 from study import Job
 
-from egopose.baseline import run_baseline_job
 from egopose.core.config import compose_config, from_mapping
 from egopose.core.result_files import write_json
 from egopose.data.preparation import flow_name, store_folder
@@ -32,7 +31,13 @@ from egopose.models.baselines.path_pose import PathPose
 from egopose.models.baselines.recurrent import RecurrentForecaster
 from egopose.motion.rotations import Array
 from egopose.pipeline.agent import Agent, load_agent
-from egopose.pipeline.baselines import forecast_qpos, load_baseline, path_pose_motion, regressed_motion
+from egopose.pipeline.baselines import (
+    forecast_qpos,
+    load_baseline,
+    path_pose_motion,
+    regressed_motion,
+    run_baseline_job,
+)
 from egopose.pipeline.dataset import absolute_paths, load_dataset, run_dataset
 from egopose.pipeline.regressor import load_regressor
 from egopose.pipeline.regressor_input import seen_in_store

@@ -13,7 +13,7 @@ from egopose.core.errors import InputError
 @command("sync")
 def main(config: DictConfig) -> None:
     """Hydra's entry."""
-    from egopose.data.sync import run_sync
+    from egopose.data.sync_offset import run_sync
 
     try:
         result = run_sync(resolved(config))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from mocap import default_humanoid
+from helpers.mocap import default_humanoid
 
 from egopose.benchmarks import env
 from egopose.benchmarks.scene_boxes import box_count, compare_with_boxes

@@ -2,22 +2,26 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
+import os
 import pickletools
 import shutil
+from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
+from helpers.toy_problem import CONFIG, make_run
 from torchrl.checkpoint import Checkpoint
 from torchrl.render import load_checkpoint
 from torchrl.render.checkpoint import infer_state_dict
-from toy_problem import CONFIG, make_run
 
 from egopose.checkpoint import checkpoint as checkpoints
 from egopose.checkpoint.checksums import CHECKSUMS, _checksums
+from egopose.core import file_digests
 from egopose.core.errors import InputError
 from egopose.training.loop import Run, train
 
@@ -280,11 +284,11 @@ def test_a_failing_save_leaves_the_old_checkpoint(tmp_path: Path, monkeypatch: p
     run = make_run(tmp_path, iterations=1)
     path = train(run, []).checkpoint
 
-    def full(folder: Path) -> dict[str, str]:
+    def full(folder: Path) -> None:
         raise OSError("no space left on device")
 
     with monkeypatch.context() as patch:
-        patch.setattr(checkpoints, "_checksums", full)
+        patch.setattr(checkpoints, "seal", full)
         run.counters.frames += 1
         with pytest.raises(checkpoints.SaveFailed, match="cannot be written: no space"):
             run.save()
@@ -299,3 +303,26 @@ def test_torchrl_reads_it(saved: tuple[Run, Path]) -> None:
         assert torch.equal(weights[key], value)
     assert payload["frames"] == saved[0].counters.frames
     assert payload["config"] == CONFIG
+
+
+def test_every_file_is_hashed_once_however_often_it_is_looked_at(copy: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    counted: Counter[str] = Counter()
+    original = hashlib.file_digest
+
+    def counting(stream: Any, algorithm: str) -> Any:
+        counted[stream.name] += os.fstat(stream.fileno()).st_size
+        return original(stream, algorithm)
+
+    monkeypatch.setattr(hashlib, "file_digest", counting)
+    monkeypatch.setattr(file_digests, "_SETTLED_AFTER", -(10**12))  # the copy was made a moment ago
+    files = [p for p in copy.rglob("*") if p.is_file() and p.name != CHECKSUMS]
+    for _ in range(2):
+        checkpoints.verify(copy)
+        assert checkpoints.has_component(copy, "policy")
+        assert checkpoints.read_json(copy, "config")["task"]["name"] == "toy"
+        checkpoints.RunCheckpoint({}).restore(copy, set())
+    assert counted == {str(file): file.stat().st_size for file in files}
+    name = flip_a_byte(copy)
+    with pytest.raises(InputError, match="does not match its checksum") as caught:
+        checkpoints.read_json(copy, "config")
+    assert caught.value.field == name

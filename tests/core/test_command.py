@@ -60,7 +60,7 @@ def test_a_slip_in_a_setting_is_told_with_what_there_is(override: str, said: str
     ],
 )
 def test_the_command_tells_it_in_one_line(words: list[str], said: str) -> None:
-    done = subprocess.run([sys.executable, "-m", "egopose", *words], capture_output=True, text=True, timeout=120)
+    done = subprocess.run([sys.executable, "-m", "egopose", *words], capture_output=True, text=True)
     assert done.returncode == 2
     (line,) = done.stderr.splitlines()
     assert line.startswith("error: ")

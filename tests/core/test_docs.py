@@ -38,7 +38,7 @@ def test_the_notebook_runs() -> None:
     notebook = nbformat.read(NOTEBOOK, 4)
     shown = [c for c in notebook.cells if any("image/png" in o.get("data", {}) for o in c.get("outputs", []))]
     assert len(shown) == 1, "the notebook is kept with its outputs: they stand on its page"
-    NotebookClient(notebook, timeout=120, kernel_name="python3").execute()
+    NotebookClient(notebook, timeout=1800, startup_timeout=600, kernel_name="python3").execute()
     printed = "".join(o.get("text", "") for c in notebook.cells for o in c.get("outputs", []))
     assert "passed" in printed
 

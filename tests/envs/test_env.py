@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from env_stand_in import PIECES, Piece, build_problem, environment, group, problem
-from humanoid_stand_in import reference_motion, stand_in
+from helpers.env_stand_in import PIECES, Piece, build_problem, environment, group, problem
+from helpers.humanoid_stand_in import reference_motion, stand_in
 from tensordict import TensorDict
 from torchrl.collectors import Collector
 from torchrl.envs.utils import check_env_specs

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from humanoid_stand_in import StandIn, reference_motion, stand_in
+from helpers.humanoid_stand_in import StandIn, reference_motion, stand_in
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation

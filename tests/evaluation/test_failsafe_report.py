@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from env_stand_in import PIECES, environment, problem
-from humanoid_stand_in import stand_in
+from helpers.env_stand_in import PIECES, environment, problem
+from helpers.humanoid_stand_in import stand_in
 from hypothesis import given
 from hypothesis import strategies as st
 from tensordict.nn import TensorDictModule

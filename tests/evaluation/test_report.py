@@ -16,7 +16,7 @@ import cv2
 import matplotlib
 import numpy as np
 import pytest
-from env_stand_in import group
+from helpers.env_stand_in import group
 from hydra import compose, initialize_config_dir
 from hypothesis import Phase, given, settings
 from hypothesis import strategies as st

@@ -5,9 +5,9 @@ from __future__ import annotations
 import mujoco
 import numpy as np
 import pytest
+from helpers.mocap import default_humanoid
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from mocap import default_humanoid
 
 from egopose.humanoid.boxes import DEPTH, with_boxes
 from egopose.humanoid.model import HumanoidModel

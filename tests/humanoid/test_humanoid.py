@@ -9,7 +9,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import pytest
-from mocap import default_config, default_humanoid, rig_motion
+from helpers.mocap import default_config, default_humanoid, rig_motion
 
 from egopose.core.config import compose_config
 from egopose.core.errors import InputError

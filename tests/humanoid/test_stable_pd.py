@@ -21,7 +21,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import pytest
-from mocap import default_humanoid
+from helpers.mocap import default_humanoid
 
 from egopose.data.prepare_motion import reference_motion
 from egopose.humanoid.model import HumanoidModel

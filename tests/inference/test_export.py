@@ -11,10 +11,10 @@ import ezc3d
 import mujoco
 import numpy as np
 import pytest
-from env_stand_in import group
+from helpers.any_motion import motions
+from helpers.env_stand_in import group
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from test_motion_bvh_roundtrip import motions
 
 from egopose.benchmarks.export import as_markdown, round_trips
 from egopose.benchmarks.read_back import read_glb

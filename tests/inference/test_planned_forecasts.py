@@ -12,10 +12,10 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from env_stand_in import PIECES
-from humanoid_stand_in import reference_motion, stand_in
-from test_motion_forecast import FPS, configuration, curves
-from test_planning import SMALL, settings
+from helpers.env_stand_in import PIECES
+from helpers.forecast_curves import FPS, configuration, curves
+from helpers.humanoid_stand_in import reference_motion, stand_in
+from helpers.planner_run import SMALL, settings
 from torch import Tensor
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 

@@ -10,8 +10,9 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from env_stand_in import build_problem, environment, group
-from humanoid_stand_in import StandIn, reference_motion, stand_in
+from helpers.env_stand_in import build_problem, environment, group
+from helpers.humanoid_stand_in import StandIn, reference_motion, stand_in
+from helpers.planner_run import SMALL, settings
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torch import Tensor
@@ -35,25 +36,7 @@ from egopose.inference.video import allowed_planner
 
 FRAMES = 60
 PIECES = (Piece(0, 0, FRAMES), Piece(1, 0, FRAMES))
-#: A search in one round, its best way taken.
-SMALL = {
-    "samples": 12,
-    "rounds": 1,
-    "tie_tolerance": 0.0,
-    "horizon": 8,
-    "every": 8,
-    "knot_spacing": 3,
-    "acceleration": 0.001,
-    "recovery_rounds": 0,
-}
 humanoid = cache(stand_in)
-
-
-def settings(**changed: Any) -> PlannerSettings:
-    """``conf/planner/ahead.yaml`` but for what is given."""
-    made = planner_settings({**compose_config("evaluate", ["checkpoint=none"])["planner"], **changed})
-    assert made is not None
-    return made
 
 
 @cache

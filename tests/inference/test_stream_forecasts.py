@@ -14,8 +14,9 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from live_stand_in import untrained, write_walk
-from test_inference_video import run  # noqa: F401  # a fixture
+from helpers.live_stand_in import untrained, write_walk
+from helpers.video_run import run  # noqa: F401  # a fixture
+from helpers.waiting import PATIENCE, wait_until
 
 from egopose.benchmarks import stream as bench
 from egopose.benchmarks.stream import untrained_forecaster
@@ -176,9 +177,7 @@ def test_what_is_due_while_another_is_made_is_skipped_and_counted() -> None:
     np.testing.assert_array_equal(slow.moments[0].flow[:, 0, 0, 0], [0, 1, 2])
     assert len(beside._flow) <= slow.context + 2
     slow.go.set()
-    end = time.monotonic() + 5
-    while beside.made < 1 and time.monotonic() < end:
-        time.sleep(0.005)
+    wait_until(lambda: beside.made >= 1, "the first forecast")
     # Where frames are missing there is no past to forecast from until there is one again.
     for frame in range(30, 36):
         beside.see(frame, flow)
@@ -243,12 +242,10 @@ def test_a_stream_forecasts_beside_its_estimate(trained: Trained, tmp_path: Path
         readers = [threading.Thread(target=read, args=(kind,), daemon=True) for kind in received]
         for reader in readers:
             reader.start()
-        end = time.monotonic() + 5
-        while not all(received.values()) and time.monotonic() < end:
-            time.sleep(0.01)
+        wait_until(lambda: all(received.values()), "each client's first message")
         last = loop.run(sinks.on_pose, sinks.on_status, None, sinks.on_forecast)
     for reader in readers:
-        reader.join(5)
+        reader.join(PATIENCE)
     assert last["poses"] == 62
     # From the thirtieth frame on, every ninth.
     assert last["forecasts"] == 4
@@ -339,8 +336,8 @@ def test_a_run_that_follows_forecasts_live_what_it_does_offline(
     (follow,) = (part for part in other.env.transform if isinstance(part, TrackForecast))
     now, problem = torch.tensor([CONTEXT - 1]), other.env.base_env.problem
     seen = context_states(other.regressor, torch.from_numpy(moment.flow), [0], CONTEXT).double()
-    follow.futures.put(other.curves(seen), now)
-    first = follow.futures.first_state(now, torch.from_numpy(moment.qpos)[None], problem.humanoid.joint_range)
+    follow.forecasts.put(other.curves(seen), now)
+    first = follow.forecasts.first_state(now, torch.from_numpy(moment.qpos)[None], problem.humanoid.joint_range)
     offline = forecast(other.env, other.actor, *first, samples, 20, seed=5 + moment.frame, noise_time=0.3)
     found = live.qpos[None] if samples == 1 else live.drawn
     np.testing.assert_allclose(found[:, :12], offline.qpos[0, :, :12], atol=1e-4)

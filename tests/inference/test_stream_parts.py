@@ -12,9 +12,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from helpers.live_stand_in import write_walk
+from helpers.waiting import PATIENCE, wait_until
 from hypothesis import given
 from hypothesis import strategies as st
-from live_stand_in import write_walk
 
 from egopose.core.errors import InputError
 from egopose.inference.stream import frame_sources as sources
@@ -351,11 +352,9 @@ def test_a_source_that_breaks_off_is_opened_anew(monkeypatch: pytest.MonkeyPatch
     settings = source_of("rtsp://host/live", reconnect=rule)
     thread = threading.Thread(target=capture, args=(settings, newest, stop), daemon=True)
     thread.start()
-    end = time.monotonic() + 5
-    while newest.reconnects < 3 and time.monotonic() < end:
-        time.sleep(0.01)
+    wait_until(lambda: newest.reconnects >= 3, "three reconnections")
     stop.set()
-    thread.join(5)
+    thread.join(PATIENCE)
     assert newest.reconnects >= 3
     assert Unsteady.opened >= 5  # the one that failed was no reconnection
     assert newest.ended or newest.take(0.0) is not None
@@ -365,9 +364,8 @@ def test_a_source_that_stays_away_ends_the_stream(monkeypatch: pytest.MonkeyPatc
     Unsteady.opened = 0
     monkeypatch.setattr(sources, "_open_address", lambda address: Unsteady(5 if Unsteady.opened == 0 else 0))
     newest = NewestFrame()
-    began = time.perf_counter()
     capture(source_of("rtsp://host/live", reconnect=ReconnectSettings(0.02, 0.04, 0.2)), newest, threading.Event())
-    assert 0.15 < time.perf_counter() - began < 3
+    assert Unsteady.opened >= 2
     assert newest.broken
     newest.take(0.0)
     with pytest.raises(InputError, match=r"rtsp://host/live: address: broke off.*give_up"):

@@ -4,18 +4,17 @@ from __future__ import annotations
 
 import itertools
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from env_stand_in import group
+from helpers.blended_regressor import KERNEL, blended
+from helpers.env_stand_in import group
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from test_material import configuration, fill_flow
 
 from egopose.core.errors import InputError
-from egopose.data.preparation import flow_name, humanoid_of, prepare
+from egopose.data.preparation import flow_name, humanoid_of
 from egopose.data.spans import Span, group_blocks, without_block
 from egopose.data.store import TakeStore
 from egopose.envs.mdp.observations import humanoid_state
@@ -30,10 +29,6 @@ from egopose.training import blended_regressor as blending
 from egopose.training.blended_regressor import KernelSettings, choose_shares, fit_kernels, share_groups, window_table
 from egopose.vision.encoders import LightFlowEncoder
 
-KERNEL = {
-    "cells": 2, "reach": 2, "step": 2, "width": 0.5, "axes": 6, "whitening": 0.5, "ridge": 0.03, "length": 1.0,
-    "metric_rows": 50, "centres": 1000, "share_step": 0.1,
-}  # fmt: skip
 LOOKAHEAD = 3
 
 
@@ -190,21 +185,6 @@ def test_group_blocks_part_nogroup(made: list[tuple[int, int]], folds: int) -> N
 
 
 # --- in a store ------------------------------------------------------------------------------------------------------
-
-
-def blended(folder: Path) -> dict[str, Any]:
-    config = configuration(folder)
-    config["regressor"] = {**config["regressor"], "cross_fit": 2, "margin": 2, "fragment_length": 16, "epochs": 2}
-    config["regressor"] |= {"kernel": KERNEL}
-    return config
-
-
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("blended")
-    prepare(configuration(folder), progress=False, flow=False)
-    fill_flow(configuration(folder))
-    return folder
 
 
 def test_a_store_makes_keeps_and_reads_back_a_blended_regressor(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from functools import cache
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from env_stand_in import group
-from test_motion_forecast import FPS, settings, unmirrored, wave
+from helpers.continued_forecaster import continued, fast
+from helpers.env_stand_in import group
+from helpers.forecast_curves import FPS, settings, unmirrored, wave
 from torch import Tensor
 
 from egopose.core.errors import InputError
@@ -34,19 +34,6 @@ def _one_thread_and_seed() -> Iterator[None]:
     torch.manual_seed(0)
     with torch_threads(1):
         yield
-
-
-@cache
-def fast() -> dict[str, Any]:
-    return group("forecaster", "fast")["continued"]
-
-
-def continued(network: dict[str, Any] | None = None, **changes: Any) -> dict[str, Any]:
-    """As ``conf/forecaster/fast.yaml`` has it, but small."""
-    given = fast()["network"]
-    optimiser = {**given["optimiser"], "batch": 4, "validation_share": 0.2}
-    small = {"recurrent": 4, "layers": 1, "context": 5, "horizon": 6, "optimiser": optimiser}
-    return {**fast(), "total_frames": 400, "network": {**given, **small, **(network or {})}, **changes}
 
 
 def with_continued(network: dict[str, Any] | None = None, **changes: Any) -> Any:

@@ -11,12 +11,12 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from env_stand_in import group
-from humanoid_stand_in import stand_in
-from test_blended import KERNEL, blended
-from test_continued_forecaster import continued
-from test_material import configuration, fill_flow
-from test_motion_forecast import FPS, SMALL, contexts_of, settings, unmirrored, wave
+from helpers.blended_regressor import KERNEL, blended
+from helpers.continued_forecaster import continued
+from helpers.env_stand_in import group
+from helpers.forecast_curves import FPS, SMALL, contexts_of, settings, unmirrored, wave
+from helpers.humanoid_stand_in import stand_in
+from helpers.small_store import configuration, fill_flow
 from torch import Tensor, nn
 
 from egopose.checkpoint.checkpoint import ComponentState, RunCheckpoint, has_component, metadata_of
@@ -368,7 +368,7 @@ def test_a_run_learns_keeps_and_reads_back_networks_and_kernel(
     size = StateLayout(dataset.humanoid.mj_model.nu).pose_size
     assert torch.equal(asked[0][0].rows[0], noisy[:5, :size])
 
-    futures = followed.futures
+    futures = followed.forecasts
     assert futures is not None
     for number, (_, starts) in enumerate(parts, start=1):
         now = starts[:, None] + torch.arange(1 - CONTEXT, 1)
@@ -389,7 +389,7 @@ def test_a_run_learns_keeps_and_reads_back_networks_and_kernel(
     assert (told - mixed(networks[:2], kernels[0], 0.0, pasts[..., :size])).abs().max() > 0.05
     for name in ("fit", "fit_kernel_forecaster"):
         monkeypatch.setattr(motion_forecasts, name, lambda *_: pytest.fail("learned twice"))
-    again = with_forecasts(config, dataset, run).futures
+    again = with_forecasts(config, dataset, run).forecasts
     assert again is not None
     assert torch.equal(again.coefficients, futures.coefficients)
 
@@ -399,7 +399,7 @@ def test_a_run_learns_keeps_and_reads_back_networks_and_kernel(
     _copy_components(run / FOLDER, shipped / FOLDER, there)
     assert not has_component(shipped / FOLDER, "futures")
     assert torch.equal(ForecastCurves(config, dataset, shipped)(pasts), told)
-    afresh = with_forecasts(config, dataset, shipped).futures
+    afresh = with_forecasts(config, dataset, shipped).forecasts
     assert afresh is not None
     assert len(afresh.starts) == 0
     assert (afresh.coefficients.shape[1:], afresh.horizon) == (futures.coefficients.shape[1:], 6)
@@ -438,7 +438,7 @@ def test_a_run_with_one_that_goes_on_frame_by_frame_learns_keeps_ships_and_reads
     for name in made_of:
         monkeypatch.setattr(motion_forecasts, name, spied(name))
     run = tmp_path / "run"
-    futures = with_forecasts(config, dataset, run).futures
+    futures = with_forecasts(config, dataset, run).forecasts
     assert futures is not None
     networks, kernels, others = made_of.values()
     assert (len(networks), len(kernels), len(others)) == (3, 3, 3)
@@ -496,7 +496,7 @@ def test_a_run_with_one_that_goes_on_frame_by_frame_learns_keeps_ships_and_reads
     assert torch.equal(ForecastCurves(config, dataset, tmp_path / "shipped")(pasts), told)
     for name in made_of:
         monkeypatch.setattr(motion_forecasts, name, lambda *_: pytest.fail("learned twice"))
-    again = with_forecasts(config, dataset, run).futures
+    again = with_forecasts(config, dataset, run).forecasts
     assert again is not None
     assert torch.equal(again.coefficients, futures.coefficients)
 
@@ -528,7 +528,7 @@ def test_a_run_from_before_there_was_a_kernel_forecasts_by_its_networks_alone(fo
     seen = pasts[..., :size]
     by_hand = sum(network((seen - network.mean) / network.std) * network.std + network.mean for network in networks)
     torch.testing.assert_close(expected, by_hand.detach() / 2)
-    found = with_forecasts(config, dataset, tmp_path).futures
+    found = with_forecasts(config, dataset, tmp_path).forecasts
     assert found is not None
     assert found.starts.tolist() == [7]
 

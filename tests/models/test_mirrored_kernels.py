@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from env_stand_in import group
+from helpers.blended_regressor import KERNEL, blended
+from helpers.env_stand_in import group
+from helpers.frame_by_frame import assert_frame_by_frame_as_the_video_up_to_there
+from helpers.small_store import configuration, fill_flow
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from test_blended import KERNEL, blended
-from test_body_parts_seen import assert_frame_by_frame_as_the_video_up_to_there
-from test_material import configuration, fill_flow
 from torch import Tensor
 
 from egopose.checkpoint import pretrained as weights

@@ -11,8 +11,16 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from env_stand_in import PIECES, group
-from humanoid_stand_in import reference_motion, stand_in
+from helpers.env_stand_in import PIECES, group
+from helpers.forecast_curves import (
+    FPS,
+    configuration,
+    contexts_of,
+    curves,
+    settings,
+    unmirrored,
+    wave,
+)
 from hypothesis import given
 from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
@@ -25,11 +33,9 @@ from egopose.core.errors import InputError
 from egopose.data.spans import Span, cross_fit_blocks, group_blocks
 from egopose.data.windows import ForecastWindow
 from egopose.envs.mdp.observations import humanoid_state
-from egopose.envs.reference_forecasts import ReferenceForecasts
 from egopose.evaluation import metrics
 from egopose.humanoid.state_layout import StateLayout
 from egopose.inference.forecast_start import begin_forecasts
-from egopose.models.mirror import StateMirror
 from egopose.models.motion_forecast import spline_basis
 from egopose.motion import rotations as rot
 from egopose.pipeline.agent import Agent
@@ -38,20 +44,7 @@ from egopose.pipeline.forecaster import with_forecasts
 from egopose.pipeline.networks import build_networks
 from egopose.tasks.dataset import Dataset
 from egopose.training.fitting import FitSettings, fit
-from egopose.training.forecaster_settings import ForecasterSettings
-from egopose.training.kernel_forecast import Contexts
 from egopose.training.motion_forecast import ForecastLearner, build_forecaster, cross_fit_starts
-
-FPS = 30.0
-SMALL: dict[str, Any] = {
-    "recurrent": 8, "hidden": 16, "spacing": 3, "context": 5, "horizon": 12, "members": 2, "kernel": None,
-    "continued": None,
-}  # fmt: skip
-
-
-def settings(**changes: Any) -> ForecasterSettings:
-    values = {key: value for key, value in group("forecaster", "fast").items() if key != "optimiser"}
-    return ForecasterSettings.from_config({**values, **SMALL, **changes})
 
 
 def test_splines_hold_cubics_and_their_slopes() -> None:
@@ -62,25 +55,6 @@ def test_splines_hold_cubics_and_their_slopes() -> None:
     weights = torch.linalg.lstsq(basis.double(), cubic.double()[:, None]).solution.float()
     torch.testing.assert_close((basis @ weights)[:, 0], cubic, atol=1e-4, rtol=0)
     torch.testing.assert_close((slope @ weights)[:, 0], -0.5 + 0.4 * t - 0.3 * t**2, atol=1e-3, rtol=0)
-
-
-@pytest.fixture(scope="module")
-def dataset() -> Dataset:
-    humanoid: Any = stand_in()
-    reference, takes = reference_motion(humanoid)
-    states = humanoid_state(reference).float()
-    return Dataset(humanoid, reference, takes, PIECES, PIECES, states=states)
-
-
-def curves(dataset: Dataset, horizon: int = 12) -> ReferenceForecasts:
-    """Curves from every frame of the first take that fit the reference from there on."""
-    poses = humanoid_state(dataset.reference).float()
-    size = StateLayout.of_size(poses.shape[1]).pose_size
-    basis = spline_basis(horizon + 1, 3, FPS)[0]
-    last = int(dataset.takes.lengths[0]) - 1
-    starts = torch.arange(last)
-    futures = poses[(starts[:, None] + torch.arange(horizon + 1)).clamp(max=last), :size]
-    return ReferenceForecasts(torch.linalg.pinv(basis) @ futures, starts, len(poses), horizon, 3, FPS)
 
 
 def test_curves_are_looked_up_as_splines_are_evaluated(dataset: Dataset) -> None:
@@ -144,23 +118,6 @@ def learner(contexts: torch.Tensor, poses: torch.Tensor, **changes: Any) -> Fore
     return ForecastLearner(seen, poses, [span], unmirrored(poses), [1], made, FPS, 8, 0.2, seed=0)
 
 
-def contexts_of(states: torch.Tensor, context: int) -> Contexts:
-    starts = torch.arange(context - 1, len(states))
-    return Contexts.at(states[starts[:, None] + torch.arange(1 - context, 1)], starts, len(states))
-
-
-def unmirrored(poses: torch.Tensor) -> StateMirror:
-    """Of a body that is its own mirror image."""
-    return StateMirror(torch.arange(poses.shape[1]), torch.ones(poses.shape[1]))
-
-
-def wave(frames: int, dofs: int = 4) -> torch.Tensor:
-    """Pose states of a body that swings its joints, one period in twelve frames."""
-    t = torch.arange(frames)[:, None] * (2 * torch.pi / 12)
-    joints = 0.5 * torch.sin(t + torch.arange(dofs))
-    return torch.cat([torch.ones(frames, 2), torch.zeros(frames, 3), joints, torch.zeros(frames, 6)], dim=1)
-
-
 def test_it_forecasts_what_can_be_known_and_the_mean_of_what_cannot() -> None:
     optimiser = FitSettings.from_config({**group("forecaster", "fast")["optimiser"], "batch": 8})
     poses = wave(200)
@@ -191,19 +148,6 @@ def test_its_error_is_the_papers() -> None:
     assert float(found) == pytest.approx(wanted, rel=1e-3)
 
 
-CONFIG: dict[str, Any] = {
-    "seed": 0,
-    "reward": group("reward", "forecasting"),
-    "model": {**group("model", "forecasting_follow"), "hidden": [8], "feedback": None},
-    "algo": {},
-}
-
-
-def configuration() -> dict[str, Any]:
-    task = {**group("task", "forecasting_follow"), "context": 5, "horizon": 13, "minimum": 4}
-    return {**CONFIG, "task": task, "forecaster": {**group("forecaster", "fast"), **SMALL}}
-
-
 def test_the_start_policy_asks_for_the_curves_next_pose(dataset: Dataset) -> None:
     followed, config = replace(dataset, forecasts=curves(dataset)), configuration()
     config["task"] = {**config["task"], "follow": {**config["task"]["follow"], "velocity_feedforward": 0.0}}
@@ -212,8 +156,8 @@ def test_the_start_policy_asks_for_the_curves_next_pose(dataset: Dataset) -> Non
     actor, critic = build_networks(config, followed, env)
     observation = critic(actor(env.reset()))
     start = observation["episode_start"].squeeze(-1)
-    assert followed.futures is not None
-    following = followed.futures.poses(start, torch.ones_like(start))
+    assert followed.forecasts is not None
+    following = followed.forecasts.poses(start, torch.ones_like(start))
     following = following[:, StateLayout.of_pose_size(following.shape[1]).joint_angles]
     rest = torch.as_tensor(dataset.humanoid.rest_action).float()
     torch.testing.assert_close(observation["loc"] + rest, following, atol=1e-6, rtol=0)
@@ -238,8 +182,8 @@ def test_what_knows_the_future_is_refused(dataset: Dataset) -> None:
 
 def test_a_forecast_follows_what_its_context_shows_and_nothing_else(dataset: Dataset, tmp_path: Path) -> None:
     followed, config = replace(dataset, forecasts=curves(dataset)), configuration()
-    assert followed.futures is not None
-    size, made = followed.futures.coefficients.shape[-1], settings()
+    assert followed.forecasts is not None
+    size, made = followed.forecasts.coefficients.shape[-1], settings()
     members = nn.ModuleList(
         [build_forecaster(made, torch.zeros(size), torch.ones(size), FPS, seed) for seed in range(made.members)]
     )
@@ -259,7 +203,7 @@ def test_a_forecast_follows_what_its_context_shows_and_nothing_else(dataset: Dat
     with torch.no_grad():
         wanted = torch.stack([member(pasts[..., :size].float()) for member in members]).mean(0)
     now = torch.tensor([w.now for w in windows])
-    first = followed.futures.poses(now, torch.zeros(2, dtype=torch.int64))
+    first = followed.forecasts.poses(now, torch.zeros(2, dtype=torch.int64))
     torch.testing.assert_close(first, wanted[:, 0])
     torch.testing.assert_close(qpos[:, 7:].float(), first[:, StateLayout.of_pose_size(size).joint_angles])
     assert qvel.isfinite().all()
@@ -284,15 +228,15 @@ def test_shipped_forecasters_bring_no_curves_of_training_and_forecast_the_same(
     found = []
     for run in ("run", "shipped"):
         followed = with_forecasts(config, dataset, tmp_path / run)
-        assert followed.futures is not None
-        assert len(followed.futures.starts) == (0 if run == "shipped" else len(known.starts))
+        assert followed.forecasts is not None
+        assert len(followed.forecasts.starts) == (0 if run == "shipped" else len(known.starts))
         path = tmp_path / run / "checkpoints" / "checkpoint-1"
         path.mkdir(parents=True)
         make_env, network = partial(build_env, config, followed), nn.Identity()
         agent = Agent(network, network, config, followed, make_env, path)  # type: ignore[arg-type]
         qpos, qvel = begin_forecasts(agent, windows, pasts)
         now = torch.tensor([windows[0].now])
-        found.append((qpos, qvel, *(followed.futures.poses(now, now * 0 + step) for step in range(12))))
+        found.append((qpos, qvel, *(followed.forecasts.poses(now, now * 0 + step) for step in range(12))))
         make_env(num_envs=1).close()
     assert all(torch.equal(one, other) for one, other in zip(*found, strict=True))
 

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from mocap import RIGS, default_humanoid, rig_motion
-from rigs import PLAIN, STANDING, Rig, write_rig
+from helpers.mocap import RIGS, default_humanoid, rig_motion
+from helpers.rigs import PLAIN, STANDING, Rig, write_rig
 
 from egopose.core.errors import InputError
 from egopose.data.prepare_motion import reference_motion

@@ -8,9 +8,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers.mocap import RIGS, default_humanoid, rig_motion
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from mocap import RIGS, default_humanoid, rig_motion
 
 from egopose.core.errors import InputError
 from egopose.data.prepare_motion import low_pass, reference_motion, without_lead_in

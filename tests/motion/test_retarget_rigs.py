@@ -12,10 +12,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers.mocap import default_humanoid
+from helpers.rigs import PLAIN, STANDING, Rig, write_rig
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from mocap import default_humanoid
-from rigs import PLAIN, STANDING, Rig, write_rig
 
 from egopose.data.prepare_motion import reference_motion, without_lead_in
 from egopose.humanoid.foot_geometry import lowest_points, sole_positions

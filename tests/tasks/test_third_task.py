@@ -10,8 +10,8 @@ from pathlib import Path
 
 import pytest
 import torch
-from mocap import short_clips
-from reach_task import TASK, ReachProblem
+from helpers.mocap import short_clips
+from tasks.reach_task import TASK, ReachProblem
 
 from egopose.checkpoint.checkpoint import find_checkpoint, read_json
 from egopose.core.config import compose_config
@@ -59,7 +59,7 @@ def test_the_command_trains_it_for_five_iterations(overrides: list[str], tmp_pat
 def test_observation_ending_reward_and_box_are_the_tasks_own(
     overrides: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setenv(VARIABLE, "reach_task")
+    monkeypatch.setenv(VARIABLE, "tasks.reach_task")
     config = compose_config("train", [*overrides]) | _reach()
     assert task_of(config) is TASK
     env = build_env(config, load_dataset(config, progress=False), num_envs=3)
@@ -93,8 +93,8 @@ def test_an_unknown_task_is_told_which_there_are() -> None:
 
 
 def test_a_module_without_a_task_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv(VARIABLE, "mocap")
-    with pytest.raises(InputError, match=f"{VARIABLE}: mocap: gives no task"):
+    monkeypatch.setenv(VARIABLE, "helpers.mocap")
+    with pytest.raises(InputError, match=f"{VARIABLE}: helpers.mocap: gives no task"):
         task_of({"task": {"name": "juggle"}})
 
 

@@ -8,10 +8,9 @@ from typing import Any
 
 import pytest
 import torch
-from env_stand_in import PIECES, environment, group, problem
-from humanoid_stand_in import reference_motion, stand_in
+from helpers.env_stand_in import environment, problem
+from helpers.forecasting_run import CONTEXT, HORIZON, configuration, forecasting_dataset
 from torchrl.modules import set_recurrent_mode
-from toy_problem import COLLECTOR, LOOP, SETTINGS
 
 from egopose.core.errors import InputError
 from egopose.envs.starts import Piece, after_context
@@ -22,35 +21,6 @@ from egopose.pipeline.networks import build_networks
 from egopose.pipeline.run import build_evaluation, build_run
 from egopose.tasks.dataset import Dataset
 from egopose.training.loop import train
-
-CONTEXT, HORIZON = 5, 8
-
-
-def forecasting_dataset() -> Dataset:
-    humanoid: Any = stand_in()
-    reference, takes = reference_motion(humanoid)
-    features = torch.randn(reference.shape[0], 6, generator=torch.Generator().manual_seed(0))
-    return Dataset(humanoid, reference, takes, PIECES, PIECES, visual_features=features)
-
-
-def configuration(**training: Any) -> dict[str, Any]:
-    loop = {**LOOP, "steps_per_iteration": 80, "iterations": 4, "checkpoint_every": 2, **training}
-    model = group("model", "forecasting")
-    return {
-        "seed": 5,
-        "task": {**group("task", "forecasting"), "context": CONTEXT, "horizon": HORIZON + 1, "minimum": 4},
-        "reward": {**group("reward", "forecasting"), "decay_horizon": HORIZON},
-        "regressor": {"std_floor": 0.05},
-        "model": {
-            **model,
-            "hidden": [8],
-            "context": {**model["context"], "hidden_size": 4, "horizon": CONTEXT},
-            "memory": {"hidden_size": 7},
-        },
-        "algo": {**SETTINGS, "minibatch_size": 40, **{k: loop.pop(k) for k in ("iterations", "steps_per_iteration")}},
-        "collector": {**COLLECTOR, "num_envs": 4},
-        "training": {**loop, "evaluation_num_envs": 2, "evaluation_seed": 1},
-    }
 
 
 @pytest.fixture(scope="module")

@@ -20,7 +20,7 @@ from egopose.core.config import from_mapping
 from egopose.core.errors import InputError
 from egopose.data.spans import Span, cross_fit_blocks, split_validation, training_windows, without_block
 from egopose.models.mirror import StateMirror
-from egopose.models.predictions import predict_span, predict_takes, regression_error
+from egopose.models.predictions import predict_span, predict_takes
 from egopose.models.regressor import StateRegressor
 from egopose.models.regressor_settings import RegressorSettings, learning_rate_at
 from egopose.training.regressor import Progress, State, build_regressor, train_regressor
@@ -210,8 +210,6 @@ def test_predictions_fill_the_takes_and_the_causal_form_keeps_its_word() -> None
     same = (causal["humanoid_state"] == again["humanoid_state"]).all(-1)
     assert same[: 200 - QUICK.lookahead].all()
     assert not same[200 - QUICK.lookahead : 300].any()
-    error = regression_error(model, states.mean(0).expand_as(states), states)
-    assert error["mse"] == pytest.approx(error["mean_mse"], rel=0.05)
 
 
 def test_mirrored_training_makes_mirrored_predictions() -> None:

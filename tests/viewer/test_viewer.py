@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 import shutil
-import time
 from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from helpers.waiting import wait_until
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -302,10 +303,7 @@ def test_in_a_browser_the_sync_is_moved_by_frames(
         page.get_by_role("button", name="Find", exact=True).click()
         page.wait_for_selector("text=/no offset stands out/")  # of a head that does not turn
         page.get_by_role("button", name="Print setting", exact=True).click()
-        deadline = time.monotonic() + 20
-        while "sync_offset: 0.700" not in capsys.readouterr().out:
-            assert time.monotonic() < deadline
-            time.sleep(0.1)
+        wait_until(lambda: "sync_offset: 0.700" in capsys.readouterr().out, "the setting is printed")
     finally:
         viewer.close()
 
@@ -365,12 +363,8 @@ def test_a_stream_is_shown_live() -> None:
     sent = Broadcast(ServerSettings("127.0.0.1", 0, None, 2, 60), hello(motion.skeleton, 30.0, 10, "test"))
     viewer = LiveViewer(f"ws://127.0.0.1:{sent.port}/json", Address(port=0))
     try:
-        deadline = time.monotonic() + 10
-        while viewer.frame < 7 and time.monotonic() < deadline:
-            pose = LivePose(frame=7, qpos=motion.qpos[7], value=1.0, confidence=None, reset=False)
-            sent.send(frame_json(pose, 30.0, 5.0))
-            time.sleep(0.05)
-        assert viewer.frame == 7
+        pose = LivePose(frame=7, qpos=motion.qpos[7], value=1.0, confidence=None, reset=False)
+        wait_until(lambda: viewer.frame == 7, "the pose is shown", lambda: sent.send(frame_json(pose, 30.0, 5.0)))
         assert not any(ghost.visible for ghost in viewer._ghosts)
         # A forecast begun two frames earlier: its poses ahead of the one shown, as far as it reaches.
         turning = np.tile(motion.qpos[7], (40, 1))
@@ -379,20 +373,20 @@ def test_a_stream_is_shown_live() -> None:
         coming = LiveForecast(5, turning, np.stack([turning] * 2), angles - 0.1, angles + 0.2, None, False)
         name = viewer._degrees[0]
         viewer._joint.value = name
-        number = 8
-        while (viewer.forecast < 5 or not viewer._angle._lines) and time.monotonic() < deadline + 10:
+        turns = itertools.count()
+
+        def send() -> None:
             sent.send(forecast_json(coming, 30.0, 80.0))
-            sent.send(frame_json(LivePose(7 + number % 2, motion.qpos[7], 1.0, None, False), 30.0, 5.0))
-            number += 1
-            time.sleep(0.05)
+            sent.send(frame_json(LivePose(7 + next(turns) % 2, motion.qpos[7], 1.0, None, False), 30.0, 5.0))
+
+        wait_until(lambda: viewer.forecast >= 5 and viewer._angle._lines, "the forecast is shown", send)
         assert viewer.forecast == 5
         assert [ghost.visible for ghost in viewer._ghosts] == [True, True, False, False]
         high, low, middle = viewer._angle._lines
         np.testing.assert_allclose(middle, turning[:, 7], atol=1e-4)
         np.testing.assert_allclose(high - low, 0.3, atol=1e-3)
         sent.send(frame_json(LivePose(7, motion.qpos[7], 1.0, None, False), 30.0, 5.0))
-        while viewer.frame != 7 and time.monotonic() < deadline + 10:
-            time.sleep(0.02)
+        wait_until(lambda: viewer.frame == 7, "the pose before is shown")
         row = 7 + 12 - 5 - 1
         posed = forward_kinematics(motion.skeleton, turning[row][None])
         root = motion.qpos[7, :3] * [1, 1, 0]  # the body shown stands before the camera

@@ -11,9 +11,10 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from live_stand_in import run_config, untrained, write_walk
-from test_blended import KERNEL, blended
-from test_material import configuration, fill_flow
+from helpers.blended_regressor import KERNEL, blended
+from helpers.frame_by_frame import assert_frame_by_frame_as_the_video_up_to_there
+from helpers.live_stand_in import run_config, untrained, write_walk
+from helpers.small_store import configuration, fill_flow
 
 from egopose.checkpoint import checkpoint
 from egopose.checkpoint.body_parts import load_body_part_estimator
@@ -21,7 +22,6 @@ from egopose.core.config import compose_config, from_mapping
 from egopose.core.errors import InputError
 from egopose.data.preparation import flow_name, humanoid_of, prepare
 from egopose.data.store import TakeStore
-from egopose.inference.causal import CausalRegression
 from egopose.inference.stream.build import load_forecaster
 from egopose.inference.stream.frame_features import FrameFeatures
 from egopose.models.blended import TimeWindows, blended_regressor, flow_cells, kernel_view
@@ -51,7 +51,6 @@ from egopose.vision.video import iter_frames
 FLOW = FlowConfig(preset="ultrafast", working_size=128, stored_size=32, workers=1)
 CAMERA = Camera(field_of_view=110.0, lens="fisheye", readout=0.02)
 LIMBS, PLACES = 5, 64  # numbers that count, and all there are, of the regressor below
-LOOKAHEAD = 3
 
 
 @pytest.fixture(autouse=True)
@@ -259,21 +258,6 @@ def test_limbs_are_in_the_windows_means_of_them() -> None:
     for t in (0, 10, 19):
         near = limbs[np.clip(t + np.arange(-4, 5), 0, 19)]
         np.testing.assert_allclose(context[t, :, 8:], weight @ near, atol=1e-5)
-
-
-@torch.no_grad()
-def assert_frame_by_frame_as_the_video_up_to_there(model: StateRegressor, features: torch.Tensor) -> None:
-    """Visual features ``[T, D]`` pushed one by one, and causally at once, say what a video does that ends later."""
-    frames = len(features)
-    causal = CausalRegression(model, torch.tensor([[-9.0, 9.0]]).repeat(52, 1), LOOKAHEAD)
-    rows = [row for t in range(frames) if (row := causal.push(t, features[t])) is not None] + list(causal.drain())
-    at_once = model.from_features(features[None], lookahead=LOOKAHEAD)["humanoid_state"][0]
-    known = [model.from_features(features[None, : t + 1])["humanoid_state"][0] for t in range(frames)]
-    assert len(rows) == frames
-    for t, row in enumerate(rows):
-        end = min(t + LOOKAHEAD, frames - 1)
-        torch.testing.assert_close(row.humanoid_state, known[end][t], atol=1e-5, rtol=1e-4)
-        torch.testing.assert_close(at_once[t], known[end][t], atol=1e-5, rtol=1e-4)
 
 
 @torch.no_grad()

@@ -53,8 +53,7 @@ def run(overrides: Sequence[str], rounds: int) -> dict[str, Any]:
     """Kill a training with SIGKILL at ``rounds`` random moments, resume it each time, and compare its end.
 
     It is training's own program, in a process of its own, on the default clips with noise for context; only Python's
-    imports are done beforehand, in a server process that each start, and each worker of it, is forked from. Workers
-    that are not in step (``collector=multi_async``) are not compared at the end: no two of their runs are alike.
+    imports are done beforehand, in a server process that each start, and each worker of it, is forked from.
 
     Args:
         overrides: of the training configuration (``collector=multi_sync``).
@@ -63,7 +62,7 @@ def run(overrides: Sequence[str], rounds: int) -> dict[str, Any]:
     Returns:
         ``kills``, ``kills_in`` each phase of a start, ``kills_in_a_write`` that left a half-written checkpoint,
         ``kills_before_a_checkpoint``. ``bit_equal``: whether every tensor and random generator of the last checkpoint
-        is that of the uninterrupted run, bit by bit (None where not compared), else ``differs`` names them;
+        is that of the uninterrupted run, bit by bit, else ``differs`` names them;
         ``curves_equal``: the same of the figures in ``curves.csv``; ``curves_whole``: whether every iteration stands
         there once. ``loaded``: how many starts came to take over a checkpoint; ``loaded_equal``: whether each took the
         newest whole one on the disk and then held, workers included, what stands in it, bit by bit; ``most_lost``
@@ -89,24 +88,22 @@ def run(overrides: Sequence[str], rounds: int) -> dict[str, Any]:
     server = context.Process(target=time.sleep, args=(0,))  # the server imports at its first process
     server.start()
     server.join()
-    in_step = config["collector"]["kind"] != "multi_async"
     with tempfile.TemporaryDirectory(prefix="egopose-resume-") as place:
         alone, killed = Path(place) / "alone", Path(place) / "killed"
-        if in_step:
-            _finish(_start(context, config, alone, 0), alone)
+        _finish(_start(context, config, alone, 0), alone)
         campaign = _Campaign(context, config, killed, random.Random(int(config["seed"])))
         for _ in range(rounds):
             campaign.kill()
         _finish(_start(context, config, killed, rounds), killed)
         campaign.wait_for_agents()
         end = find_checkpoint(killed)
-        differs = unequal(content(find_checkpoint(alone)), content(end)) if in_step else []
+        differs = unequal(content(find_checkpoint(alone)), content(end))
         curves = _curves(killed)
         loads = [json.loads(line) for line in killed.with_suffix(LOADED).read_text().splitlines()]
         return {
             "kills": campaign.kills.total(),
-            "bit_equal": not differs if in_step else None,
-            "curves_equal": _curves(alone) == curves if in_step else None,
+            "bit_equal": not differs,
+            "curves_equal": _curves(alone) == curves,
             "curves_whole": [float(row["iteration"]) for row in curves] == list(range(1, len(curves) + 1)),
             "differs": differs,
             "loaded": len(loads),

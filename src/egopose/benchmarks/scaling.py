@@ -94,11 +94,7 @@ def run(overrides: Sequence[str], rounds: int) -> dict[str, Any]:
         mapped = partial(_make_env, config, replace(dataset, visual_context=table))
         for count in _POOLS:
             out |= _workers(count, replace(settings, workers=count), mapped, ppo, file, out, rounds)
-    for kind in ("sync", "multi_async"):
-        workers = 1 if kind == "sync" else 2
-        chosen = replace(settings, kind=kind, workers=workers, physics_threads=1)
-        out |= _whole_iterations(f"{kind}_{workers}", chosen, make_env, ppo, out, rounds)
-    return out
+    return out | _whole_iterations("sync_1", replace(settings, kind="sync", workers=1), make_env, ppo, out, rounds)
 
 
 def _make_env(config: Mapping[str, Any], dataset: Any, num_envs: int, number: int) -> EnvBase:
@@ -280,9 +276,5 @@ def _rate(name: str, collector: Any, batches: Any, ppo: Any, settings: Any, roun
     learner = (time.process_time() - here) / rounds
     workers = [(_worked_s(pid) - start) / rounds for pid, start in zip(pids, begun, strict=True)]
     set_threads(settings.threads)
-    if settings.kind == "multi_async":
-        # As many cores as workers, which learner and workers share.
-        needed = max(learner, (sum(workers) + learner) / len(workers))
-    else:
-        needed = max(workers, default=0.0) + learner
+    needed = max(workers, default=0.0) + learner
     return {f"measured_{name}": frames / seconds, f"worked_{name}": frames / needed}

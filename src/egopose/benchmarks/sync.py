@@ -11,7 +11,7 @@ from egopose.core.config import compose_config
 from egopose.core.errors import InputError
 from egopose.data.preparation import prepare
 from egopose.data.prepare_motion import without_lead_in
-from egopose.data.sync import find_offset, head_turning, settings_of, video_turning
+from egopose.data.sync_offset import find_offset, head_turning, settings_of, video_turning
 from egopose.data.take_sources import find_sources
 from egopose.motion.io import read_motion
 from egopose.motion.motion import Motion

@@ -1,23 +1,13 @@
-"""Checkpoints: a folder of memory-mapped tensors and JSON, without pickle, that refuses what does not match.
-
-The layout is TorchRL's ``torchrl.checkpoint.Checkpoint`` in its directory format (so ``torchrl.render.load_checkpoint``
-and TorchRL's own tools read it), with SHA-256 checksums added::
-
-    manifest.json        TorchRL's: versions, components; our schema, task and counters under "metadata"
-    checksums.json       {file: sha256} over every other file
-    components/NNNN-policy/{state.json, state/*.memmap} ...
-
-Components: ``policy critic policy_optimizer value_optimizer transforms rng simulation trainer_state config``.
-"""
+"""Checksums of a folder's files, kept beside them in ``checksums.json``: {file: SHA-256} over every other file."""
 
 from __future__ import annotations
 
-import hashlib
 import json
 from pathlib import Path
 
 from egopose.core import safe_io
 from egopose.core.errors import InputError
+from egopose.core.file_digests import sha256_of
 
 CHECKSUMS = "checksums.json"
 
@@ -28,7 +18,7 @@ def seal(folder: Path) -> None:
 
 
 def check_files(folder: Path) -> None:
-    """Compare every file of ``folder`` with the checksums written beside it.
+    """Compare every file of ``folder`` with the checksums written beside it; a file is read once a process.
 
     Raises:
         InputError: a file is missing, added or altered.
@@ -51,8 +41,4 @@ def _files(folder: Path) -> list[Path]:
 
 
 def _checksums(folder: Path) -> dict[str, str]:
-    out = {}
-    for file in _files(folder):
-        with file.open("rb") as stream:
-            out[file.relative_to(folder).as_posix()] = hashlib.file_digest(stream, "sha256").hexdigest()
-    return out
+    return {file.relative_to(folder).as_posix(): sha256_of(file) for file in _files(folder)}

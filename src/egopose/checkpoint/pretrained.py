@@ -1,6 +1,6 @@
 """Trained weights that come with the package: a small run directory each, named ``weights:NAME`` on a command line.
 
-``egopose ship`` makes them, ``docs/model-card.md`` says what they are.
+``egopose package`` makes them, ``docs/model-card.md`` says what they are.
 """
 
 from __future__ import annotations

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
@@ -13,15 +14,17 @@ from torchrl.collectors import Collector
 from torchrl.envs import EnvBase
 
 from egopose.collection.env_groups import GroupedCollector
-from egopose.collection.lazy_rewards import Completion, GaussianSampler, draws_gaussian
+from egopose.collection.lazy_rewards import Completion, GaussianSampler, draws_otherwise
 from egopose.collection.stepping import TransformedEgoPoseEnv
 from egopose.collection.workers import Workers, base_env, read_simulation, write_simulation
 from egopose.core.config import from_mapping
 from egopose.core.errors import InputError
 from egopose.core.torch_settings import enable_onednn_matmul
+from egopose.models.recurrent import is_recurrent
 
 __all__ = [
     "CollectorSettings",
+    "SlowPolicyWarning",
     "base_env",
     "build_collector",
     "load_simulation_state",
@@ -31,7 +34,12 @@ __all__ = [
     "transform_state",
 ]
 
-KINDS = ("sync", "multi_sync", "multi_async", "ray")
+
+class SlowPolicyWarning(UserWarning):
+    """A policy cannot be called in the quick way."""
+
+
+KINDS = ("sync", "multi_sync", "ray")
 
 
 @dataclass(frozen=True)
@@ -39,8 +47,8 @@ class CollectorSettings:
     """See ``conf/collector``.
 
     Args:
-        kind: ``sync`` in this process; ``multi_sync`` and ``multi_async`` in processes, ``ray`` on machines of a Ray
-            cluster: see :class:`egopose.collection.workers.Workers`.
+        kind: ``sync`` in this process; ``multi_sync`` in processes, ``ray`` on machines of a Ray cluster: see
+            :class:`egopose.collection.workers.Workers`.
         num_envs: of one environment.
         physics_threads: of one environment.
         workers: processes, each with an environment of its own.
@@ -95,22 +103,27 @@ def build_collector(
 ) -> Collector | Workers:
     """A collector that never ends; one iteration gives ``steps_per_iteration`` control steps over all worlds.
 
-    ``make_env`` gets the worker's number, to seed by. ``sync`` sets the environment to defer its rewards.
+    ``make_env`` gets the worker's number, to seed by. ``sync`` sets the environment to defer its rewards. It warns
+    where a policy without a memory cannot be called in the quick way, with the reason.
 
     ``track_traj_ids=False`` and ``device=None`` because they are the quickest (measured; see docs/howto-bench.md).
     """
     enable_onednn_matmul()
     if settings.kind == "sync":
         env = make_env(0)
-        acting = GaussianSampler(policy) if draws_gaussian(policy) else policy
+        reason = draws_otherwise(policy)
+        acting = GaussianSampler(policy) if reason is None else policy
         collector: Callable[..., Collector] = Collector
         if isinstance(env, TransformedEgoPoseEnv):
             env.make_rewards_lazy()
-            if isinstance(acting, GaussianSampler) and acting.draws_from_entries():
+            reason = acting.needs_tensordicts() if isinstance(acting, GaussianSampler) else reason
+            if reason is None:
                 env_groups = settings.env_groups or min(
                     settings.num_envs, 1 + (env.base_env.physics.substeps >= settings.env_groups_from)
                 )
                 collector = partial(GroupedCollector, env_groups=env_groups)
+            elif not is_recurrent(policy):  # a memory is handed on in TorchRL's own way
+                _warn_of_slow_policy(reason)
         return collector(
             env,
             acting,
@@ -130,6 +143,15 @@ def build_collector(
         threads=settings.threads,
         cpus=settings.physics_threads,
         address=settings.address,
+    )
+
+
+def _warn_of_slow_policy(reason: str) -> None:
+    """Once a reason and process, as warnings are."""
+    warnings.warn(
+        f"the policy is called in TorchRL's own way, which takes longer than the quick one: {reason}",
+        SlowPolicyWarning,
+        stacklevel=3,
     )
 
 

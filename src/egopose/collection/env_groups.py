@@ -31,7 +31,7 @@ class GroupedCollector(Collector):
 
     Args:
         env: whose worlds are parted.
-        policy: without a memory, see :meth:`GaussianSampler.draws_from_entries`.
+        policy: without a memory, see :meth:`GaussianSampler.needs_tensordicts`.
         env_groups: how many.
         **settings: of TorchRL's collector.
     """

@@ -24,7 +24,7 @@ class GaussianSampler(TensorDictModuleBase):
     Writes what the actor does but ``action_log_prob``, which :class:`Completion` adds.
 
     Args:
-        actor: see :func:`draws_gaussian`.
+        actor: see :func:`draws_otherwise`.
     """
 
     def __init__(self, actor: ProbabilisticTensorDictSequential) -> None:
@@ -41,12 +41,17 @@ class GaussianSampler(TensorDictModuleBase):
             tensordict = part(tensordict)
         return tensordict.set("action", torch.normal(tensordict["loc"], tensordict["scale"]))
 
-    def draws_from_entries(self) -> bool:
-        """Whether :meth:`act` can stand for :meth:`forward`: every part reads and writes plain entries."""
-        return all(
-            type(part) is TensorDictModule and all(isinstance(key, str) for key in (*part.in_keys, *part.out_keys))
-            for part in self._parts
-        )
+    def needs_tensordicts(self) -> str | None:
+        """Why :meth:`act` cannot stand for :meth:`forward`, by the part at fault.
+
+        None where it can: every part reads and writes plain entries.
+        """
+        for part in self._parts:
+            if type(part) is not TensorDictModule:
+                return f"its part {type(part).__name__} is no plain TensorDictModule"
+            if nested := [key for key in (*part.in_keys, *part.out_keys) if not isinstance(key, str)]:
+                return f"its part {type(part.module).__name__} reads or writes the nested entry {nested[0]}"
+        return None
 
     def act(self, entries: MutableMapping[Any, Any]) -> None:
         """:meth:`forward` on a plain mapping, at a third of its expense."""
@@ -54,13 +59,15 @@ class GaussianSampler(TensorDictModuleBase):
         entries["action"] = torch.normal(entries["loc"], entries["scale"])
 
 
-def draws_gaussian(policy: TensorDictModuleBase) -> bool:
-    """Whether ``policy`` is an actor as :func:`egopose.models.policy.build_actor` makes it, nothing behind it."""
-    return (
-        isinstance(policy, ProbabilisticTensorDictSequential)
-        and getattr(policy.module[-1], "distribution_class", None) is IndependentNormal
-        and "action_log_prob" in policy.out_keys
-    )
+def draws_otherwise(policy: TensorDictModuleBase) -> str | None:
+    """Why ``policy`` is no actor as :func:`egopose.models.policy.build_actor` makes it; None where it is one."""
+    if not isinstance(policy, ProbabilisticTensorDictSequential):
+        return f"it is a {type(policy).__name__} and no ProbabilisticActor"
+    if getattr(policy.module[-1], "distribution_class", None) is not IndependentNormal:
+        return "its last part draws from no IndependentNormal"
+    if "action_log_prob" not in policy.out_keys:
+        return "it does not write action_log_prob"
+    return None
 
 
 class Completion:

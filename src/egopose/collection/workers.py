@@ -1,4 +1,4 @@
-"""Environments in processes of their own, on this machine or on many: one collector over TorchRL's three.
+"""Environments in processes of their own, on this machine or on many: one collector over TorchRL's two.
 
 Between two of its batches a worker is idle, and only then is it spoken to: a message that reaches a busy worker of
 TorchRL makes it throw its batch away. What is exchanged then: the worker gives the statistics of its normaliser and
@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
-from torchrl.collectors import Collector, MultiAsyncCollector, MultiSyncCollector
+from torchrl.collectors import Collector, MultiSyncCollector
 from torchrl.collectors.distributed import RayCollector
 from torchrl.envs import EnvBase, TransformedEnv
 
@@ -90,25 +90,12 @@ class WorkerCollector(Collector):
         return _packed(self.policy.state_dict())
 
 
-class _AnnouncingCollector(MultiAsyncCollector):
-    """Tells whose batch has come in while that worker still waits to be sent on."""
-
-    announce: Callable[[int], None] | None = None
-
-    def _get_from_queue(self, timeout: float | None = None) -> tuple[int, int, TensorDictBase]:
-        index, round_, batch = super()._get_from_queue(timeout)
-        if self.announce is not None:
-            self.announce(index)
-        return index, round_, batch
-
-
 class Workers:
     """Batches ``[workers * worlds, T]`` from environments in other processes; see ``conf/collector``.
 
     Args:
-        kind: ``multi_sync``: all workers in step, on the newest weights. ``multi_async``: workers collect on while the
-            networks are updated; an iteration takes as many pieces as there are workers, from whoever has one, the
-            oldest collected on weights one update old. ``ray``: in step, on any machine of a Ray cluster.
+        kind: ``multi_sync``: processes of this machine. ``ray``: on any machine of a Ray cluster. With both all workers
+            are in step, on the newest weights.
         make_env: makes the environment of the worker of that number, in its process.
         policy: whose parameters :meth:`update_policy_weights_` sends.
         workers: how many.
@@ -144,13 +131,12 @@ class Workers:
             self._end_ray = _join_ray(workers * cpus, address)
             self._collector = _ray_collector(makers, policy, frames, threads, cpus)
         else:
-            collector_class = _AnnouncingCollector if kind == "multi_async" else MultiSyncCollector
-            self._collector = collector_class(
+            self._collector = MultiSyncCollector(
                 makers,
                 policy,
-                frames_per_batch=frames * (workers if kind == "multi_sync" else 1),
+                frames_per_batch=frames * workers,
                 total_frames=-1,
-                cat_results=0 if kind == "multi_sync" else None,
+                cat_results=0,
                 use_buffers=True,
                 num_sub_threads=threads,
                 num_threads=torch.get_num_threads(),
@@ -163,15 +149,10 @@ class Workers:
         # What the workers' first resets counted is still theirs to report.
         self.transforms = without_counts(reports[0]["transforms"])
         self._given = [self.transforms] * workers
-        if kind == "multi_async":
-            self._collector.announce = self._exchange
 
     def __iter__(self) -> Iterator[TensorDictBase]:
         batches = iter(self._collector)
         while True:
-            if self.kind == "multi_async":
-                yield torch.cat([next(batches) for _ in range(self.count)])
-                continue
             with self._ray_watch():
                 batch = next(batches)
             self._exchange_all()
@@ -223,13 +204,6 @@ class Workers:
         self.transforms = merged
         self._given = [merged] * self.count
 
-    def _exchange(self, number: int) -> None:
-        report = _unpacked(self._call(number, "report"))
-        self.simulation[number] = report["simulation"]
-        self.transforms = merge_states(self.transforms, [report["transforms"]], [self._given[number]])
-        self._call(number, "load_transform_state", _packed(self.transforms))
-        self._given[number] = self.transforms
-
     def _call_all(self, method: str, arguments: list[tuple[Any, ...]] | None = None) -> list[Any]:
         with self._ray_watch():
             return list(self._collector.map_fn(method, arguments))
@@ -260,15 +234,6 @@ class Workers:
         except RayActorError as error:
             return error
         return None
-
-    def _call(self, number: int, method: str, *arguments: Any) -> Any:
-        # TorchRL asks all workers or none; this is what its `map_fn` does, for one.
-        pipe = self._collector.pipes[number]
-        pipe.send(((method, arguments, {}), "cascade_execute"))
-        result, _ = self._collector._recv_and_check(pipe, worker_idx=number)
-        if isinstance(result, Exception):
-            raise result
-        return result
 
 
 def _seeded(make_env: Callable[[int], EnvBase], seed: int, number: int) -> EnvBase:

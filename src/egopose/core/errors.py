@@ -21,3 +21,7 @@ class InputError(ValueError):
     def __reduce__(self) -> tuple[type[InputError], tuple[str, str, str]]:
         # BaseException would rebuild it from its message alone, and a worker process could not hand it to its parent.
         return type(self), (self.source, self.field, self.cause)
+
+
+class NoOpenGL(InputError, RuntimeError):
+    """Nothing can be drawn on this machine as it is; says what to install or to set."""

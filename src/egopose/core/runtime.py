@@ -7,7 +7,8 @@ import logging
 import multiprocessing
 import os
 import threading
-import warnings
+
+from egopose.core.opengl import switch_off_what_cannot_work
 
 
 def prepare_runtime() -> None:
@@ -16,12 +17,13 @@ def prepare_runtime() -> None:
     OpenMP's idle threads spin by default and starve the physics' threads of the same cores; these settings make them
     sleep. Values already in the environment win.
 
-    dm_control tries for a window on import; without a screen GLFW warns of it, and absl tells of each attempt. Neither
-    says anything about this project's own choice of an OpenGL backend, which comes later (:mod:`egopose.vision.gl`).
+    MuJoCo and dm_control bind an OpenGL back end when they are imported; one that cannot work is switched off for them
+    (:mod:`egopose.core.opengl`). This project's own choice of a back end comes later (:mod:`egopose.vision.gl`). absl
+    tells of each attempt, which says nothing about that choice.
     """
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     os.environ.setdefault("GOMP_SPINCOUNT", "0")
-    warnings.filterwarnings("ignore", message=".*DISPLAY environment variable", module="glfw")
+    switch_off_what_cannot_work()
     logging.getLogger("absl").setLevel(logging.WARNING)
 
 

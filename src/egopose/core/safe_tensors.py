@@ -8,12 +8,13 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import torch
-from tensordict import TensorDict
+from tensordict import MemoryMappedTensor, TensorDict
+from torch import Tensor
 
 from egopose.core.errors import InputError
 from egopose.core.safe_io import MAX_FILES, read_json
@@ -33,25 +34,67 @@ _KEY = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.\-]{0,200}")
 _NOT_TENSORS = ("_type", "shape", "device")
 
 
-def load_tensors(folder: Path, field: str) -> TensorDict:
+class CopyOnWriteTensor(MemoryMappedTensor):
+    """A tensor mapped from a file that nothing done to the tensor changes.
+
+    Processes share the file's pages as long as they only read. A page that is written to becomes the writer's own.
+    Sent to another process it goes by the file's name and is mapped there in the same way.
+    """
+
+    @classmethod
+    def from_filename(
+        cls, filename: str | Path, dtype: torch.dtype, shape: torch.Size | Sequence[int], index: Any = None
+    ) -> CopyOnWriteTensor:
+        """As ``MemoryMappedTensor.from_filename``, which maps every file it may write to for writing."""
+        shape = torch.Size(shape)
+        tensor = torch.from_file(str(filename), shared=False, dtype=dtype, size=shape.numel()).view(shape)
+        out = cls(tensor if index is None else tensor[index])
+        out.filename, out.index, out.parent_shape = filename, index, shape
+        out._handler = None
+        return out
+
+    def _index_wrap(self, tensor: Any, item: Any, check: bool = False) -> Any:
+        out = super()._index_wrap(tensor, item, check)
+        if type(out) is MemoryMappedTensor:  # what a part of the tensor would be, and sent be mapped for writing
+            out.__class__ = type(self)
+        return out
+
+
+def load_tensors(folder: Path, field: str, *, writable: bool = False) -> TensorDict:
     """A flat TensorDict mapped from a folder that was looked through first (:func:`check_tensors`).
+
+    Args:
+        folder: of ``meta.json`` and the tensors.
+        field: what it is, for errors.
+        writable: what is written to the tensors is written to their files; else to this process's memory alone.
 
     Raises:
         InputError: as :func:`check_tensors`, or the tensors do not fit together.
     """
-    check_tensors(folder, field)
+    meta = check_tensors(folder, field)
+    kind = MemoryMappedTensor if writable else CopyOnWriteTensor
+
+    def mapped(key: str) -> Tensor:
+        shape, dtype = torch.Size(meta[key]["shape"]), _DTYPES[meta[key]["dtype"]]
+        if not shape.numel():  # a file of nothing cannot be mapped
+            return torch.empty(shape, dtype=dtype)
+        return kind.from_filename(folder / f"{key}.memmap", dtype, shape)
+
     try:
-        return TensorDict.load_memmap(folder, allow_pickle=False)
-    except Exception as error:  # tensordict raises whatever the damage happens to be
+        return TensorDict({key: mapped(key) for key in meta if key not in _NOT_TENSORS}, batch_size=meta["shape"])
+    except Exception as error:  # torch and tensordict raise whatever the damage happens to be
         raise InputError(folder, field, f"is damaged: {error}"[:300]) from None
 
 
-def check_tensors(folder: Path, field: str) -> None:
+def check_tensors(folder: Path, field: str) -> dict[str, Any]:
     """A folder of ``meta.json`` and ``*.memmap`` must hold plain tensors, each as long as it says, and nothing else.
 
     A file that was cut off would be mapped with zeros at its end in silence, one that is a link would let the owner of
     the folder have other files written to; pickles and classes other than TensorDict run code or import it. Other JSON
     files may stand beside them.
+
+    Returns:
+        ``meta.json``: the shape, and of every tensor its shape and type.
 
     Raises:
         InputError: names the folder, ``field`` and what stands there instead.
@@ -76,6 +119,7 @@ def check_tensors(folder: Path, field: str) -> None:
         there = file.stat().st_size if file.is_file() else 0
         if there < size:
             raise InputError(folder, field, f"is damaged: {file.name[:60]} is cut off or missing")
+    return meta
 
 
 def _is_plain_tensor(key: str, entry: Any) -> bool:

@@ -19,7 +19,7 @@ from egopose.data.lock import store_lock
 from egopose.data.prepare_motion import PreparationSettings, reference_motion
 from egopose.data.reference import reference_states, supported
 from egopose.data.store import Fragment, TakeInfo, TakeStore, runs_of
-from egopose.data.sync import settings_of, sync_offset
+from egopose.data.sync_offset import settings_of, sync_offset
 from egopose.data.take_sources import TakeSource, find_sources
 from egopose.humanoid.config import HumanoidConfig, SimConfig
 from egopose.humanoid.foot_geometry import lowest_points

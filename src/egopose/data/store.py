@@ -2,12 +2,16 @@
 
 A folder::
 
-    store.json            schema, fps, fingerprint of humanoid and preparation, the takes
+    store.json            schema, fps, fingerprint of humanoid and preparation, the takes, checksums (reference, clips)
     clips/<take>.npz      the reference clips in the project's own format
     videos/<take>.mp4     the wearer's video (rendered, or a link to the user's own)
     reference/            TensorDict [F], float64: the body-state keys
     flow/<name>/          TensorDict [F]: flow [2, S, S] float16; done.json lists the takes that are in
-    tables/<name>/        TensorDicts [F] of trained encoders and regressors, each with its own card.json
+    tables/<name>/        TensorDicts [F] of trained encoders and regressors, each with its card.json and checksums.json
+
+What is read is mapped copy-on-write: a change in place stays in the memory of the process that makes it. Reference,
+clips and tables are compared with their SHA-256 once a process, and again once a file's size or times have changed.
+Flow and videos, by far the largest, are not. A store from before there were checksums opens as it did.
 """
 
 from __future__ import annotations
@@ -28,12 +32,14 @@ from torch import Tensor
 
 from egopose.core.config import convert, from_mapping
 from egopose.core.errors import InputError
+from egopose.core.file_digests import sha256_of
 from egopose.core.safe_io import read_json
 from egopose.core.safe_tensors import load_tensors
 from egopose.motion.io import read_motion, write_motion
 from egopose.motion.motion import Motion
 
 SCHEMA = 1
+_CHECKSUMS = "checksums.json"
 #: What every frame of ``reference/`` has; see :func:`egopose.data.reference.reference_states`.
 REFERENCE_KEYS = ("qpos", "qvel", "xpos", "xquat", "com", "com_vel")
 
@@ -109,6 +115,7 @@ class TakeStore:
                 path, "schema", f"is {card['schema']}, this version reads {SCHEMA}; prepare the data again"
             )
         self.card: dict[str, Any] = card
+        self._checksums = _as_checksums(path, card.get("checksums", {}))
         self.fps = float(card["fps"])
         self.takes = tuple(_take_info(path, row, number) for number, row in enumerate(card["takes"]))
         self.frames_total = 0
@@ -150,7 +157,9 @@ class TakeStore:
         for take, clip in zip(takes, clips, strict=True):
             write_motion(clip, part / "clips" / f"{take.name}.motion.npz")
         states.memmap(part / "reference")
-        card = {"schema": SCHEMA, "fps": fps, "fingerprint": fingerprint, "takes": [asdict(t) for t in takes]}
+        checksums = _checksums(part, "clips", "reference")
+        rows = [asdict(take) for take in takes]
+        card = {"schema": SCHEMA, "fps": fps, "fingerprint": fingerprint, "takes": rows, "checksums": checksums}
         (part / "store.json").write_text(json.dumps(card, indent=1))
         os.replace(part, root)
         return cls(root)
@@ -161,8 +170,13 @@ class TakeStore:
 
     @property
     def reference(self) -> TensorDict:
-        """Body states ``[F]`` of all takes, float64, memory-mapped."""
+        """Body states ``[F]`` of all takes, float64, memory-mapped.
+
+        Raises:
+            InputError: missing, damaged, or altered since it was made.
+        """
         states = self._load(self.root / "reference", "reference")
+        self._check("reference", self._checksums)
         if missing := set(REFERENCE_KEYS) - set(states.keys()):
             raise InputError(self.root, "reference", f"is damaged: {', '.join(sorted(missing))} missing")
         if len(states) != self.frames_total:
@@ -175,7 +189,8 @@ class TakeStore:
         return slice(info.offset, info.offset + info.length)
 
     def clip(self, take: int) -> Motion:
-        """The reference clip of a take."""
+        """The reference clip of a take. Raises InputError: it was altered since it was made."""
+        self._check(f"clips/{self.takes[take].name}.motion.npz", self._checksums)
         return read_motion(self.root / "clips" / f"{self.takes[take].name}.motion.npz")
 
     def video(self, take: int) -> Path:
@@ -207,7 +222,7 @@ class TakeStore:
         return set(done)
 
     def open_flow(self, name: str, size: int) -> Tensor:
-        """The flow table to be filled; made on first use."""
+        """The flow table to be filled, what is written to it goes to its file; made on first use."""
         folder = self.root / "flow" / name
         if not folder.is_dir():
             part = folder.with_name(name + ".part")
@@ -218,7 +233,7 @@ class TakeStore:
             )
             TensorDict({"flow": table}, batch_size=[self.frames_total]).memmap_(part)
             os.replace(part, folder)
-        return self._load(folder, f"flow/{name}")["flow"]
+        return self._load(folder, f"flow/{name}", writable=True)["flow"]
 
     def mark_flow(self, name: str, take: int) -> None:
         """Note that a take's flow is in."""
@@ -231,8 +246,16 @@ class TakeStore:
         return (self.root / "tables" / name / "card.json").is_file()
 
     def table(self, name: str) -> TensorDict:
-        """Tensors ``[F, ...]`` of a trained encoder or regressor, memory-mapped."""
-        return self._load(self.root / "tables" / name, f"tables/{name}")
+        """Tensors ``[F, ...]`` of a trained encoder or regressor, memory-mapped.
+
+        Raises:
+            InputError: missing, damaged, or altered since it was made.
+        """
+        tensors = self._load(self.root / "tables" / name, f"tables/{name}")
+        path = self.root / "tables" / name / _CHECKSUMS
+        if path.is_file():
+            self._check(f"tables/{name}", _as_checksums(path, read_json(path, "checksums")))
+        return tensors
 
     def table_card(self, name: str) -> dict[str, Any]:
         """What the table's maker noted about it."""
@@ -256,13 +279,42 @@ class TakeStore:
         part.mkdir(parents=True)
         TensorDict(dict(tensors), batch_size=[self.frames_total]).memmap(part)
         (part / "card.json").write_text(json.dumps(card, indent=1))
+        checksums = {f"tables/{name}/{file}": digest for file, digest in _checksums(part, ".").items()}
+        (part / _CHECKSUMS).write_text(json.dumps(checksums, indent=1))
         shutil.rmtree(folder, ignore_errors=True)
         os.replace(part, folder)
 
-    def _load(self, folder: Path, field: str) -> TensorDict:
+    def _load(self, folder: Path, field: str, writable: bool = False) -> TensorDict:
         if not folder.is_dir():
             raise InputError(self.root, field, "is missing: python -m egopose.prepare makes it")
-        return load_tensors(folder, field)
+        return load_tensors(folder, field, writable=writable)
+
+    def _check(self, part: str, checksums: dict[str, str]) -> None:
+        """The files of ``part``, a file or a folder of the store, must be those that were written."""
+        for name, digest in checksums.items():
+            if name != part and not name.startswith(f"{part}/"):
+                continue
+            file = self.root / name
+            if file.is_file() and sha256_of(file) != digest:  # one that is missing is missed by who reads it
+                away = f"{self.root / part}" if part.startswith("tables/") else f"{self.root}"
+                cause = f"was altered since it was made: delete {away}, and it is made anew"
+                raise InputError(self.root, name, cause)
+
+
+def _checksums(root: Path, *parts: str) -> dict[str, str]:
+    """SHA-256 of every file under ``parts`` of a folder, by its name there."""
+    files = (file for part in parts for file in sorted((root / part).rglob("*")) if file.is_file())
+    return {file.relative_to(root).as_posix(): sha256_of(file) for file in files}
+
+
+def _as_checksums(path: Path, value: Any) -> dict[str, str]:
+    """What stands in a file for checksums; names that lead out of the store are refused."""
+    if not isinstance(value, dict) or not all(isinstance(digest, str) for digest in value.values()):
+        raise InputError(path, "checksums", "is damaged: must be the SHA-256 of each file")
+    for name in value:
+        if Path(name).is_absolute() or ".." in Path(name).parts:
+            raise InputError(path, "checksums", f"is damaged: {name!r:.60} lies outside the store")
+    return value
 
 
 def _take_info(path: Path, row: Any, number: int) -> TakeInfo:

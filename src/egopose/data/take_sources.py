@@ -28,7 +28,7 @@ class TakeSource:
         motion: file to read.
         options: for the reader (``unit``, ``up``, ``asf`` ...).
         video: the wearer's MP4, or None to render one.
-        sync_offset: s, see :class:`egopose.data.store.TakeInfo`; None: to be found (:mod:`egopose.data.sync`).
+        sync_offset: s, see :class:`egopose.data.store.TakeInfo`; None: to be found (:mod:`egopose.data.sync_offset`).
         mapping: part -> joint for skeletons whose names say too little.
         camera: that took the video, or None where nothing is known of it.
     """

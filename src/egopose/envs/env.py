@@ -357,10 +357,11 @@ class EgoPoseEnv(EnvBase):
     def _watched(self, body: dict[str, Tensor], worlds: slice) -> dict[str, Tensor]:
         """What the problem watches of the present step beside the body, taken out of ``body``."""
         tops, turns = body.pop("box_tops", None), body.pop("box_quaternions", None)
-        parts = {name: body.pop(name) for name in ("floor_contacts", "box_contacts", "torques") if name in body}
+        parts: dict[str, Tensor] = {
+            name: body.pop(name) for name in ("floor_contacts", "box_contacts", "torques") if name in body
+        }
         if "scene" in self.problem.watched:
-            assert tops is not None and turns is not None, "a problem that watches the scene has boxes"
-            parts["scene"] = torch.cat([tops, turns], dim=-1)
+            parts["scene"] = torch.cat([tops, turns], dim=-1)  # type: ignore[list-item]
         if "target" in self.problem.watched:
             parts["target"] = self._targets[worlds].clone()
         return parts

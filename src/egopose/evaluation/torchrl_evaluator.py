@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
-from functools import partial
+import threading
+import uuid
+from functools import cached_property, partial
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
+from weakref import WeakValueDictionary
 
 import torch
 from tensordict.nn import TensorDictModuleBase
@@ -15,7 +18,7 @@ from egopose.checkpoint.checkpoint import find_checkpoint, read_json
 from egopose.core.errors import InputError
 from egopose.core.runtime import end_with_parent
 from egopose.evaluation.trial import trial_env, trial_figures
-from egopose.pipeline.agent import load_agent
+from egopose.pipeline.agent import Agent, load_agent
 from egopose.tasks.dataset import Dataset
 
 BACKENDS = ("thread", "process")
@@ -53,8 +56,9 @@ def checkpoint_evaluator(
     _require(backend)
     folder = find_checkpoint(checkpoint, which)
     steps = int(read_json(folder, "config")["task"]["horizon"]) - 1
-    env = partial(_checkpoint_env, folder, dataset, split, num_envs, seed, threads)
-    return _evaluator(env, partial(_checkpoint_policy, folder, dataset), backend, num_envs, steps)
+    trained = _Trained.of(folder, dataset, uuid.uuid4().hex)
+    env = partial(_checkpoint_env, trained, split, num_envs, seed, threads)
+    return _evaluator(env, partial(_checkpoint_policy, trained), backend, num_envs, steps)
 
 
 def _require(backend: str) -> None:
@@ -82,13 +86,40 @@ def _one_thread() -> None:
     torch.set_num_threads(1)
 
 
-def _checkpoint_env(
-    folder: Path, dataset: Dataset | None, split: str, num_envs: int, seed: int, threads: int
-) -> TransformedEnv:
-    agent = load_agent(folder, dataset)
+class _Trained:
+    """The agent of a checkpoint, loaded once in each process that works with it."""
+
+    #: By token: what makes the environment and what makes the policy are sent to another process one by one.
+    _here: ClassVar[WeakValueDictionary[str, _Trained]] = WeakValueDictionary()
+
+    def __init__(self, folder: Path, dataset: Dataset | None, token: str) -> None:
+        self._folder, self._dataset, self._token = folder, dataset, token
+        self._lock = threading.Lock()
+        self._here[token] = self
+
+    @classmethod
+    def of(cls, folder: Path, dataset: Dataset | None, token: str) -> _Trained:
+        """The one with this token, made where this process has none yet."""
+        return cls._here.get(token) or cls(folder, dataset, token)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _Trained.of, (self._folder, self._dataset, self._token)
+
+    def agent(self) -> Agent:
+        """See :func:`load_agent`."""
+        with self._lock:
+            return self._agent
+
+    @cached_property
+    def _agent(self) -> Agent:
+        return load_agent(self._folder, self._dataset)
+
+
+def _checkpoint_env(trained: _Trained, split: str, num_envs: int, seed: int, threads: int) -> TransformedEnv:
+    agent = trained.agent()
     env = agent.make_env(split, num_envs=num_envs, threads=threads)
     return trial_env(env, int(agent.config["task"]["horizon"]) - 1, seed)
 
 
-def _checkpoint_policy(folder: Path, dataset: Dataset | None, env: EnvBase | None = None) -> TensorDictModuleBase:
-    return load_agent(folder, dataset).actor
+def _checkpoint_policy(trained: _Trained, env: EnvBase | None = None) -> TensorDictModuleBase:
+    return trained.agent().actor

@@ -20,7 +20,7 @@ from torchrl.envs import TransformedEnv
 from torchrl.envs.transforms import Transform
 
 from egopose.envs.env import EgoPoseEnv
-from egopose.pipeline.agent import load_agent
+from egopose.pipeline.agent import load_actor, load_agent
 from egopose.tasks.dataset import Dataset
 from egopose.vision.rendering import SceneRenderer
 
@@ -88,4 +88,4 @@ def make_policy(ckpt_path: str | Path, dataset: Dataset | None = None) -> Tensor
     Raises:
         InputError: the checkpoint cannot be used.
     """
-    return load_agent(ckpt_path, dataset).actor
+    return load_actor(ckpt_path, dataset)

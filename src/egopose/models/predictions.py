@@ -11,7 +11,6 @@ from torch import Tensor
 
 from egopose.core.torch_settings import torch_threads
 from egopose.data.spans import Span
-from egopose.humanoid.state_layout import StateLayout
 from egopose.models.regressor import StateRegressor
 from egopose.models.regressor_settings import RegressorSettings
 
@@ -66,25 +65,3 @@ def predict_takes(
             for key, table in tables.items():
                 table[span.start : span.stop] = outputs[key]
     return tables
-
-
-def regression_error(model: StateRegressor, predicted: Tensor, targets: Tensor) -> dict[str, float]:
-    """Mean squared errors in normalised units, and those of predicting the training mean for the same frames.
-
-    Args:
-        model: whose statistics define the units.
-        predicted: ``[N, S]`` states z.
-        targets: ``[N, S]``.
-
-    Returns:
-        ``mse`` and ``mean_mse``, over all numbers of the state, and both by part: ``root_pose``, ``joint_angles``,
-        ``root_velocity``, ``joint_velocities``.
-    """
-    wanted = model.normalise(targets)
-    error, spread = (model.normalise(predicted) - wanted).square(), wanted.square()
-    layout = StateLayout.of_size(targets.shape[-1])
-    out = {"mse": error.mean().item(), "mean_mse": spread.mean().item()}
-    for part in ("root_pose", "joint_angles", "root_velocity", "joint_velocities"):
-        out[f"mse_{part}"] = error[:, getattr(layout, part)].mean().item()
-        out[f"mean_mse_{part}"] = spread[:, getattr(layout, part)].mean().item()
-    return out

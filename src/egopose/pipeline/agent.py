@@ -15,9 +15,18 @@ import torch
 from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import TransformedEnv
 
-from egopose.checkpoint.checkpoint import RunCheckpoint, find_checkpoint, read_json, require, verify
+from egopose.checkpoint.checkpoint import (
+    ComponentState,
+    RunCheckpoint,
+    find_checkpoint,
+    read_json,
+    require,
+    verify,
+)
 from egopose.core.errors import InputError
 from egopose.envs.transforms import StateNormalizer
+from egopose.humanoid.config import HumanoidConfig
+from egopose.models.policy import PolicySettings, build_actor, build_critic
 from egopose.pipeline.dataset import run_dataset
 from egopose.pipeline.environment import build_env
 from egopose.pipeline.forecaster import with_forecasts
@@ -99,6 +108,102 @@ def load_agent(
         return made
 
     return Agent(actor.eval(), critic.eval(), config, dataset, make_env, folder)
+
+
+@dataclass(frozen=True)
+class Policy:
+    """A trained policy by itself, without the data it was trained on.
+
+    Attributes:
+        actor, critic: in evaluation mode. They read normalised observations.
+        normalizer: of ``humanoid_state``, as trained and frozen.
+        config: resolved, of its run.
+        path: the checkpoint.
+    """
+
+    actor: TensorDictModuleBase
+    critic: TensorDictModuleBase
+    normalizer: StateNormalizer
+    config: dict[str, Any]
+    path: Path
+
+
+def load_policy(path: str | Path, which: str = "best") -> Policy:
+    """The networks of a checkpoint whose visual context comes with the observation; no data is prepared or read.
+
+    Args:
+        path: a checkpoint folder or a run directory.
+        which: of a run directory, the ``best`` or the ``latest`` checkpoint.
+
+    Raises:
+        InputError: the checkpoint is damaged, or its networks read a table of the data (``model.context.source``);
+            names the field.
+    """
+    folder = find_checkpoint(path, which)
+    config = read_json(folder, "config")
+    settings = PolicySettings.from_config(config["model"])
+    if settings.context.source != "frozen":
+        cause = f"{settings.context.source} reads the features of its data: load_agent brings both"
+        raise InputError(folder, "model.context.source", cause)
+    saved: dict[str, dict[str, Any]] = {"policy": {}, "transforms": {}}
+    parts = {name: ComponentState(dict, state.update) for name, state in saved.items()}
+    metadata = RunCheckpoint(parts).restore(folder, set(parts))
+    normalizer = _normalizer(saved["transforms"], folder)
+    widths = _observation_widths(settings, saved["policy"], len(normalizer.mean), int(metadata["action_size"]), folder)
+    joints = HumanoidConfig.from_mapping(config["humanoid"]).skeleton().joints
+    names = [f"{joint.name}_{number}" for joint in joints for number in range(len(joint.dofs))]
+    actor = build_actor(settings, widths, int(metadata["action_size"]), dof_names=names)
+    critic = build_critic(settings, widths)
+    RunCheckpoint({"policy": actor, "critic": critic}).restore(folder, {"policy", "critic"})
+    return Policy(actor.eval(), critic.eval(), normalizer, config, folder)
+
+
+def load_actor(path: str | Path, dataset: Dataset | None = None, which: str = "best") -> TensorDictModuleBase:
+    """The actor of a checkpoint; data is prepared only where it reads a table of it.
+
+    Args:
+        path: a checkpoint folder or a run directory.
+        dataset: to run on, as :func:`load_agent`; without one only the actor's weights are read where that will do.
+        which: of a run directory, the ``best`` or the ``latest`` checkpoint.
+
+    Raises:
+        InputError: see :func:`load_policy` and :func:`load_agent`.
+    """
+    folder = find_checkpoint(path, which)
+    if dataset is None and read_json(folder, "config")["model"]["context"]["source"] == "frozen":
+        return load_policy(folder).actor
+    return load_agent(folder, dataset).actor
+
+
+def _normalizer(state: Mapping[str, Any], folder: Path) -> StateNormalizer:
+    """The frozen normaliser among the states of an environment's transforms."""
+    prefixes = [key.removesuffix("sum_of_squares") for key in state if key.endswith(".sum_of_squares")]
+    if len(prefixes) != 1:
+        raise InputError(folder, "transforms", f"holds {len(prefixes)} normalisers where one is expected")
+    values = {name: state[f"{prefixes[0]}{name}"] for name in ("count", "mean", "sum_of_squares")}
+    normalizer = StateNormalizer(len(values["mean"]), frozen=True)
+    normalizer.load_state_dict(values)
+    return normalizer
+
+
+def _observation_widths(
+    settings: PolicySettings, actor: Mapping[str, Any], state_size: int, action_size: int, folder: Path
+) -> dict[str, int]:
+    """What each observation's last axis is; that of the visual context is what the actor's first layer has left."""
+    widths = {
+        "humanoid_state": state_size,
+        "tracking_error": 2 * state_size,
+        "followed_targets": action_size,
+        "time_left": 1,
+    }
+    known = state_size if settings.memory is None else settings.memory.hidden_size
+    if unknown := set(settings.inputs) - set(widths):
+        raise InputError(folder, "model.inputs", f"{sorted(unknown)[0]!r}: its width is not known without the data")
+    known += sum(widths[key] for key in settings.inputs)
+    first = next((value for key, value in actor.items() if key.endswith("mean.0.weight")), None)
+    if first is None or first.ndim != 2 or first.shape[1] <= known:
+        raise InputError(folder, "policy.mean.0.weight", "is no first layer of an actor of this configuration")
+    return {**widths, "visual_context": first.shape[1] - known}
 
 
 def _other_store(own: Mapping[str, Any], config: Mapping[str, Any]) -> bool:

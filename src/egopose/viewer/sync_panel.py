@@ -13,7 +13,7 @@ import viser
 
 from egopose.core.config import compose_config
 from egopose.core.errors import InputError
-from egopose.data.sync import Sync, find_offset, head_turning, settings_of, video_turning
+from egopose.data.sync_offset import Sync, find_offset, head_turning, settings_of, video_turning
 from egopose.motion.rotations import Array
 from egopose.viewer.charts import Chart
 from egopose.viewer.clip import Clip, Footage

@@ -9,8 +9,17 @@ import subprocess
 import sys
 from typing import Any
 
+from egopose.core.errors import NoOpenGL
+from egopose.core.opengl import asked_backend, use_backend
+
 # OSMesa first: in software, but it opened and closed cleanly wherever it was tried, which EGL did not.
 _CANDIDATES = {"linux": ("osmesa", "egl", "glfw"), "darwin": ("cgl",), "win32": ("glfw",)}
+
+_INSTALL = {
+    "osmesa": "`apt-get install libosmesa6`",
+    "egl": "`apt-get install libegl1` and the graphics card's driver",
+    "glfw": "it needs a display",
+}
 
 _PROBE = """
 import importlib, mujoco
@@ -24,15 +33,15 @@ context.free()
 
 @functools.cache
 def choose_backend() -> str:
-    """The name of a back end that works: ``MUJOCO_GL`` where it is set, else the first that passes a trial.
+    """The name of a back end: ``MUJOCO_GL`` where it is set, else the first that passes a trial.
 
     A back end that fails may abort the process, so each is tried in one of its own. The choice is left in
     ``MUJOCO_GL`` for MuJoCo, dm_control and child processes.
 
     Raises:
-        RuntimeError: none works; the message says what to install.
+        NoOpenGL: none works; says what to install.
     """
-    asked = os.environ.get("MUJOCO_GL", "").strip().lower()
+    asked = asked_backend()
     candidates = _CANDIDATES.get(sys.platform, ("glfw",))
     if asked in candidates:
         return asked
@@ -46,16 +55,16 @@ def choose_backend() -> str:
         except subprocess.TimeoutExpired:
             continue
         if done.returncode == 0:
-            os.environ["MUJOCO_GL"] = backend
+            use_backend(backend)
             return backend
-    raise RuntimeError("no OpenGL without a display here: install one, e.g. `apt-get install libosmesa6`")
+    raise NoOpenGL("OpenGL", "back end", "none works here without a display: `apt-get install libosmesa6`")
 
 
 def open_context(width: int, height: int) -> Any:
     """A current OpenGL context with ``make_current`` and ``free``.
 
     Raises:
-        RuntimeError: none can be opened; the message says what to install.
+        NoOpenGL: none can be opened; says what to install.
     """
     backend = choose_backend()
     try:
@@ -63,6 +72,7 @@ def open_context(width: int, height: int) -> Any:
         context = importlib.import_module(f"mujoco.{backend}").GLContext(width, height)
         context.make_current()
     except Exception as error:
-        cause = f"OpenGL by {backend} fails ({error}): try MUJOCO_GL=osmesa after `apt-get install libosmesa6`"
-        raise RuntimeError(cause) from error
+        told = " ".join(str(error).split())[:100]
+        cause = f"fails ({told}): {_INSTALL.get(backend, 'try another')}, or unset MUJOCO_GL to have one found"
+        raise NoOpenGL("MUJOCO_GL", backend, cause) from error
     return context

@@ -312,18 +312,6 @@ def side_view_frames(
             yield np.concatenate(panels, axis=1)
 
 
-def render_side_view(
-    model: mujoco.MjModel,
-    motions: Sequence[Array],
-    labels: Sequence[str],
-    path: str | PathLike[str],
-    size: int,
-    fps: float,
-) -> None:
-    """Write :func:`side_view_frames` to an MP4."""
-    write_video(path, side_view_frames(model, motions, labels, size), fps)
-
-
 def label_frame(frame: Frame, label: str) -> Frame:
     """A copy of the frame with a line of text at its upper left, readable on any ground."""
     frame = frame.copy()

@@ -1,0 +1,67 @@
+"""The training command in a process of its own."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import textwrap
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from helpers.waiting import PATIENCE
+
+TESTS = Path(__file__).parents[1]
+
+
+# The command, on the toy problem: `pipeline` is replaced by one that builds it.
+LAUNCHER = """
+import sys, types
+sys.path.insert(0, {tests!r})
+from helpers.toy_problem import make_run
+stand_in = types.ModuleType("egopose.pipeline")
+from egopose.training.loop import interrupts_held
+def build_run(config, folder, dataset):
+    with interrupts_held():
+        return make_run(folder, seed=config["seed"], config=config, iterations=config["algo"]["iterations"],
+                        checkpoint_every=config["training"]["checkpoint_every"],
+                        max_seconds=config["training"]["max_seconds"],
+                        collector={{name: config["collector"][name] for name in ("kind", "workers")}})
+stand_in.build_run = build_run
+stand_in.load_dataset = lambda config: None
+stand_in.run_dataset = lambda config, folder: None
+stand_in.build_evaluation = lambda run, dataset: None
+sys.modules["egopose.pipeline"] = stand_in
+import egopose
+egopose.pipeline = stand_in
+from egopose.train import main
+if __name__ == "__main__":
+    main()
+"""
+
+
+@pytest.fixture(scope="module")
+def launcher(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("launcher") / "launch.py"
+    path.write_text(textwrap.dedent(LAUNCHER.format(tests=str(TESTS))))
+    return path
+
+
+def start(launcher: Path, cwd: Path, *words: str, **how: Any) -> subprocess.Popen[str]:
+    return subprocess.Popen(
+        [sys.executable, str(launcher), *words],
+        cwd=cwd,
+        text=True,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        env=os.environ | {"OMP_NUM_THREADS": "1"},
+        **how,
+    )
+
+
+def command(launcher: Path, cwd: Path, *words: str) -> tuple[int, str, str]:
+    process = start(launcher, cwd, *words)
+    out, err = process.communicate(timeout=PATIENCE)
+    return process.returncode, out, err
