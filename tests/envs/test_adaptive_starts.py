@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 import torch
 from helpers.env_stand_in import PIECES, environment, problem
-from test_training_pipeline import assert_equal, configuration, estimation_dataset
+from helpers.estimation_run import assert_equal, configuration, estimation_dataset
 
 from egopose.core.errors import InputError
 from egopose.envs.starts import AdaptiveStarts, AdaptiveStartSettings, training_starts

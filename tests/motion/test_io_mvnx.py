@@ -8,11 +8,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers.hostile import blamed, run_child
 from helpers.mocap import default_humanoid
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from test_hostile_limits import run_child
-from test_motion_io_hostile import blamed
 
 from egopose.core.errors import InputError
 from egopose.motion import rotations as rot

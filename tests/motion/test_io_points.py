@@ -11,12 +11,11 @@ from pathlib import Path
 import ezc3d
 import numpy as np
 import pytest
+from helpers.hostile import blamed, run_child
 from helpers.marker_files import in_file, layout, write_layout
 from helpers.mocap import default_humanoid, rig_motion
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from test_hostile_limits import run_child
-from test_motion_io_hostile import blamed
 
 from egopose.core.errors import InputError
 from egopose.motion import rotations as rot
