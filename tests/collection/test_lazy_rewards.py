@@ -89,6 +89,29 @@ class Steady(nn.Module):
         return mean, torch.full_like(mean, 1e-9)
 
 
+def test_the_switch_off_gives_the_same_numbers_by_torchrls_own_rollout() -> None:
+    """``collector.fast=false`` with TorchRL's stepping, resets and rewards at each step, against the quick path."""
+    actor = make_actor(make_env())
+    steps = WORLDS * STEPS
+    slow = build_collector(replace(SETTINGS, fast=False), make_env, actor, steps)
+    assert type(slow) is Collector
+    assert not slow.env.fast
+    assert "reward_terms" in slow.env.base_env.observation_spec.keys(), "rewards come with each step"  # noqa: SIM118
+    batches = []
+    for collector in (slow, build_collector(SETTINGS, make_env, actor, steps)):
+        torch.manual_seed(2)
+        rows = iter(collector)
+        batches.append([next(rows) for _ in range(3)])
+        collector.shutdown()
+    for theirs, ours in zip(*batches, strict=True):
+        assert theirs["next", "done"].any()
+        for key in set(theirs.keys(True, True)):
+            if key[0] == "reward_terms":  # of the step before: nothing reads them
+                continue
+            want, got = theirs[key], ours[key]
+            torch.testing.assert_close(got.double(), want.double(), rtol=1e-6, atol=1e-6, msg=str(key))
+
+
 def test_lanes_that_take_turns_give_what_all_worlds_in_step_give() -> None:
     def steady_env(number: int) -> TransformedEgoPoseEnv:
         base = environment(WORLDS, seed=3)

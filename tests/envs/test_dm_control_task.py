@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 import torch
-from helpers.env_stand_in import PIECES, environment, problem
+from helpers.env_stand_in import PIECES, build_problem, environment, group, problem
+from helpers.forecast_curves import curves
+from helpers.humanoid_stand_in import reference_motion, stand_in
 from torchrl.envs.libs.dm_control import DMControlWrapper
 from torchrl.envs.utils import check_env_specs
 
 from egopose.envs.dm_control_task import load_environment
 from egopose.envs.starts import WholeFragments
+from egopose.tasks.dataset import Dataset
 
 
 def pair(**kwargs):
@@ -47,6 +52,29 @@ def test_both_environments_agree(scale: float) -> None:
             break
     assert ended
     assert (step.discount == 0) == (scale > 1)
+
+
+def test_with_forecasts_both_begin_where_the_curve_does() -> None:
+    """A forecast begins in its own first state, not in the reference's: in both environments."""
+    humanoid: Any = stand_in()
+    reference, takes = reference_motion(humanoid)
+    forecasts = curves(Dataset(humanoid, reference, takes, PIECES, PIECES))
+    forecasts.coefficients[..., 5:] += 0.05
+    task = group("task", "forecasting")
+    given = build_problem(humanoid, reference, takes, task, group("reward", "forecasting"), forecasts=forecasts)
+    starts = WholeFragments(PIECES[:1], takes.offsets, takes.lengths)
+    batch = environment(2, problem=given, fragments=PIECES[:1], whole_fragments=True)
+    one = load_environment(given, starts)
+    step, td = one.reset(), batch.reset()
+    plain = given.observation(given.reference_at(batch.frame))
+    assert (td["humanoid_state"] - plain).abs().max() > 0.03, "the curve begins elsewhere than the reference"
+    rng = np.random.default_rng(1)
+    for _ in range(8):
+        z = given.observation(batch.body_state())
+        np.testing.assert_allclose(step.observation["humanoid_state"], z[1], atol=1e-9, rtol=0)
+        action = rng.normal(0, 0.1, batch.action_spec.shape[-1]).astype(np.float32)
+        step = one.step(action)
+        td = batch.step(td.set("action", torch.from_numpy(action).expand(2, -1)))["next"]
 
 
 def test_divergence_ends_the_single_world_too(tmp_path, monkeypatch) -> None:

@@ -3,16 +3,21 @@
 from __future__ import annotations
 
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
-from helpers.env_stand_in import environment, problem
+from helpers.env_stand_in import PIECES, environment, problem
+from helpers.forecast_curves import configuration as following
+from helpers.forecast_curves import curves
 from helpers.forecasting_run import CONTEXT, HORIZON, configuration, forecasting_dataset
+from helpers.humanoid_stand_in import reference_motion, stand_in
 from torchrl.modules import set_recurrent_mode
 
 from egopose.core.errors import InputError
+from egopose.envs.mdp.observations import humanoid_state
 from egopose.envs.starts import Piece, after_context
 from egopose.models.context import ForwardContext
 from egopose.models.recurrent import PastContext, collecting_policy, hidden_keys
@@ -31,6 +36,19 @@ def dataset() -> Dataset:
 @pytest.fixture(scope="module")
 def run(dataset: Dataset, tmp_path_factory: pytest.TempPathFactory) -> Any:
     return build_run(configuration(), tmp_path_factory.mktemp("run"), dataset)
+
+
+def test_a_policy_that_follows_forecasts_is_looked_at_where_there_are_some(tmp_path: Path) -> None:
+    """Forecasts begin on training frames alone: a look at the policy between iterations must not ask for others."""
+    humanoid: Any = stand_in()
+    reference, takes = reference_motion(humanoid)
+    known = Dataset(humanoid, reference, takes, PIECES[:1], PIECES[1:], states=humanoid_state(reference).float())
+    dataset = replace(known, forecasts=curves(known))
+    own = configuration(evaluate_every=1, iterations=2)
+    config = {**own, **{group: value for group, value in following().items() if group != "algo"}}
+    run = build_run(config, tmp_path, dataset)
+    train(run, [], build_evaluation(run, dataset))
+    assert run.counters.score > 0
 
 
 def test_sequences_give_what_steps_gave(run: Any) -> None:

@@ -59,6 +59,7 @@ class CollectorSettings:
             ``env_groups_from`` steps of physics a control step on: below, taking turns costs more than it hides.
         env_groups_from: see ``env_groups``.
         address: of the Ray cluster, see :class:`egopose.collection.workers.Workers`.
+        fast: of ``sync``: False collects by TorchRL's own rollout, with the same numbers at more expense.
     """
 
     kind: str
@@ -70,6 +71,7 @@ class CollectorSettings:
     env_groups: int | None = 1
     env_groups_from: int = 8
     address: str | None = None
+    fast: bool = True
 
     @classmethod
     def from_config(cls, values: Mapping[str, Any], source: str = "conf/collector") -> CollectorSettings:
@@ -103,14 +105,16 @@ def build_collector(
 ) -> Collector | Workers:
     """A collector that never ends; one iteration gives ``steps_per_iteration`` control steps over all worlds.
 
-    ``make_env`` gets the worker's number, to seed by. ``sync`` sets the environment to defer its rewards. It warns
-    where a policy without a memory cannot be called in the quick way, with the reason.
+    ``make_env`` gets the worker's number, to seed by. ``sync`` takes the quick path (:mod:`egopose.collection`) unless
+    ``settings.fast`` is off. It warns where a policy without a memory cannot be called in that way, with the reason.
 
     ``track_traj_ids=False`` and ``device=None`` because they are the quickest (measured; see docs/howto-bench.md).
     """
     enable_onednn_matmul()
     if settings.kind == "sync":
         env = make_env(0)
+        if not settings.fast:
+            return _torchrl_collector(env, policy, steps_per_iteration)
         reason = draws_otherwise(policy)
         acting = GaussianSampler(policy) if reason is None else policy
         collector: Callable[..., Collector] = Collector
@@ -143,6 +147,20 @@ def build_collector(
         threads=settings.threads,
         cpus=settings.physics_threads,
         address=settings.address,
+    )
+
+
+def _torchrl_collector(env: EnvBase, policy: TensorDictModuleBase, steps_per_iteration: int) -> Collector:
+    """TorchRL's collector and its own way through an environment, step by step."""
+    if isinstance(env, TransformedEgoPoseEnv):
+        env.fast = False
+    return Collector(
+        env,
+        policy,
+        frames_per_batch=steps_per_iteration,
+        total_frames=-1,
+        track_traj_ids=False,
+        auto_register_policy_transforms=False,
     )
 
 

@@ -75,10 +75,14 @@ class TransformedEgoPoseEnv(TransformedEnv):
     Args:
         env: the environment.
         *transforms: in order; any that only reads and writes observations at steps and resets.
+
+    Attributes:
+        fast: False leaves stepping to TorchRL altogether.
     """
 
     def __init__(self, env: EgoPoseEnv, *transforms: Transform) -> None:
         super().__init__(env, Compose(*transforms))
+        self.fast = True
 
     def make_rewards_lazy(self) -> None:
         """See :meth:`EgoPoseEnv.make_rewards_lazy`."""
@@ -87,6 +91,8 @@ class TransformedEgoPoseEnv(TransformedEnv):
 
     def step_and_maybe_reset(self, tensordict: TensorDictBase) -> tuple[TensorDictBase, TensorDictBase]:
         """See ``EnvBase.step_and_maybe_reset``: the transition, and what the next step starts from."""
+        if not self.fast:
+            return super().step_and_maybe_reset(tensordict)
         written = tensordict.get("next", None)
         after = self.transform._step(tensordict, self.base_env._step(tensordict))
         if written is not None:

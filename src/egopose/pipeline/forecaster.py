@@ -74,8 +74,8 @@ def with_forecasts(config: Mapping[str, Any], dataset: Dataset, run: Path) -> Da
     if not folder.is_dir():
         _train(config, dataset, folder)
     saved: dict[str, Tensor] = {}
-    if has_component(folder, "forecasts"):
-        RunCheckpoint({"forecasts": ComponentState(dict, saved.update)}).restore(folder, {"forecasts"})
+    if has_component(folder, "futures"):
+        RunCheckpoint({"futures": ComponentState(dict, saved.update)}).restore(folder, {"futures"})
     else:  # shipped without those of its training frames: others are put in where a forecast begins
         assert dataset.states is not None
         knots, size = spline_basis(settings.horizon + 1, settings.spacing, _fps(dataset))[0].shape[1], _size(dataset)
@@ -219,7 +219,7 @@ def _train(config: Mapping[str, Any], dataset: Dataset, folder: Path) -> None:
     part = folder.with_name(f"{FOLDER}.part")
     shutil.rmtree(part, ignore_errors=True)
     made: dict[str, Any] = {"members": nn.ModuleList(whole.networks)}
-    made["forecasts"] = ComponentState(lambda: table, lambda _: None)
+    made["futures"] = ComponentState(lambda: table, lambda _: None)
     if whole.kernel is not None:
         sizes = {"centres": torch.tensor(len(whole.kernel.kernel.centres))}
         made["kernel"], made["sizes"] = whole.kernel, ComponentState(lambda: sizes, lambda _: None)

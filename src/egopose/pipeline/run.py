@@ -104,14 +104,15 @@ def _training_env(
 def build_evaluation(run: Run, dataset: Dataset) -> Evaluation:
     """A look at the mean action while training: frames survived on the test fragments, from starts that stay the same.
 
-    Its ``score`` is the mean number of frames survived.
+    Its ``score`` is the mean number of frames survived. A policy that follows a run's forecasts is looked at on the
+    training fragments: there alone are forecasts, cross-fitted ones.
     """
     config = run.config
     training = config["training"]
     env = build_env(
         config,
         dataset,
-        "test",
+        "test" if dataset.forecasts is None else "train",
         num_envs=int(training["evaluation_num_envs"]),
         threads=int(config["collector"]["physics_threads"]),
     )
