@@ -53,6 +53,10 @@ class Members:
     continued_share: Tensor | None = None
 
 
+#: The component of the training frames' forecasts: its name, and that of runs from before.
+_SAVED_AS = ("forecasts", "futures")
+
+
 def with_forecasts(config: Mapping[str, Any], dataset: Dataset, run: Path) -> Dataset:
     """The dataset with the run's forecasts, trained where that has not been done.
 
@@ -73,8 +77,8 @@ def with_forecasts(config: Mapping[str, Any], dataset: Dataset, run: Path) -> Da
     if not folder.is_dir():
         _train(config, dataset, folder)
     saved: dict[str, Tensor] = {}
-    if has_component(folder, "forecasts"):
-        RunCheckpoint({"forecasts": ComponentState(dict, saved.update)}).restore(folder, {"forecasts"})
+    if (name := next((one for one in _SAVED_AS if has_component(folder, one)), None)) is not None:
+        RunCheckpoint({name: ComponentState(dict, saved.update)}).restore(folder, {name})
     else:  # shipped without those of its training frames: others are put in where a forecast begins
         assert dataset.states is not None
         knots, size = spline_basis(settings.horizon + 1, settings.spacing, _fps(dataset))[0].shape[1], _size(dataset)
