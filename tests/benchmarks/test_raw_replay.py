@@ -12,7 +12,7 @@ from helpers.env_stand_in import environment
 from torchrl.collectors import Collector
 
 from egopose.benchmarks.raw_replay import RawReplay, StepRecorder, compare_with_raw
-from egopose.core import runtime
+from egopose.core import torch_settings as runtime
 from egopose.core.torch_settings import enable_onednn_matmul
 
 
@@ -75,7 +75,7 @@ def test_the_runtime_is_prepared_before_torch() -> None:
 def test_quick_products_keep_single_precision() -> None:
     """As numpy's double precision says, whichever library multiplies; bfloat16 would be off by 2e-3."""
     code = (
-        "import torch; from egopose.core.runtime import enable_onednn_matmul; quick = enable_onednn_matmul();"
+        "import torch; from egopose.core.torch_settings import enable_onednn_matmul; quick = enable_onednn_matmul();"
         "setting = torch.backends.mkldnn.matmul.fp32_precision; assert (setting == 'bf16') == quick, setting;"
         "a, b = torch.randn(500, 700), torch.randn(700, 300); exact = a.double().numpy() @ b.double().numpy();"
         "error = (((a @ b).numpy() - exact) ** 2).mean() ** 0.5 / exact.std(); assert error < 5e-6, error"

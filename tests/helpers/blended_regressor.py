@@ -5,10 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-import pytest
-
-from egopose.data.preparation import prepare
-from helpers.small_store import configuration, fill_flow
+from helpers.small_store import configuration
 
 KERNEL = {
     "cells": 2, "reach": 2, "step": 2, "width": 0.5, "axes": 6, "whitening": 0.5, "ridge": 0.03, "length": 1.0,
@@ -21,11 +18,3 @@ def blended(folder: Path) -> dict[str, Any]:
     config["regressor"] = {**config["regressor"], "cross_fit": 2, "margin": 2, "fragment_length": 16, "epochs": 2}
     config["regressor"] |= {"kernel": KERNEL}
     return config
-
-
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("blended")
-    prepare(configuration(folder), progress=False, flow=False)
-    fill_flow(configuration(folder))
-    return folder

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import Any
 
-import pytest
 import torch
 
 from egopose.envs.mdp.observations import humanoid_state
@@ -14,8 +13,7 @@ from egopose.models.motion_forecast import spline_basis
 from egopose.tasks.dataset import Dataset
 from egopose.training.forecaster_settings import ForecasterSettings
 from egopose.training.kernel_forecast import Contexts
-from helpers.env_stand_in import PIECES, group
-from helpers.humanoid_stand_in import reference_motion, stand_in
+from helpers.env_stand_in import group
 
 FPS = 30.0
 
@@ -29,14 +27,6 @@ SMALL: dict[str, Any] = {
 def settings(**changes: Any) -> ForecasterSettings:
     values = {key: value for key, value in group("forecaster", "fast").items() if key != "optimiser"}
     return ForecasterSettings.from_config({**values, **SMALL, **changes})
-
-
-@pytest.fixture(scope="module")
-def dataset() -> Dataset:
-    humanoid: Any = stand_in()
-    reference, takes = reference_motion(humanoid)
-    states = humanoid_state(reference).float()
-    return Dataset(humanoid, reference, takes, PIECES, PIECES, states=states)
 
 
 def curves(dataset: Dataset, horizon: int = 12) -> ReferenceForecasts:

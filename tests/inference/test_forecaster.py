@@ -91,7 +91,7 @@ def test_physics_that_breaks_stands_still(actor: Any) -> None:
 
 def test_worlds_must_fit(actor: Any) -> None:
     env = build_env(configuration(), MATERIAL, num_envs=3)
-    with pytest.raises(ValueError, match="num_envs"):
+    with pytest.raises(ValueError, match="need as many worlds"):
         forecast(env, actor, MATERIAL.reference["qpos"][NOW], MATERIAL.reference["qvel"][NOW])
 
 

@@ -7,12 +7,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.video_run import FRAMES, settings
+from helpers.video_run import FRAMES, run, settings
 
 from egopose.core.errors import InputError
 from egopose.inference.video import estimate_video
 from egopose.motion.io import read_motion
 from egopose.vision.video import probe_video, write_video
+
+__all__ = ["run"]  # a fixture
 
 
 def moving_picture(frames: int) -> list[np.ndarray]:

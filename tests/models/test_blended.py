@@ -10,11 +10,12 @@ import pytest
 import torch
 from helpers.blended_regressor import KERNEL, blended
 from helpers.env_stand_in import group
+from helpers.small_store import configuration, fill_flow
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from egopose.core.errors import InputError
-from egopose.data.preparation import flow_name, humanoid_of
+from egopose.data.preparation import flow_name, humanoid_of, prepare
 from egopose.data.spans import Span, group_blocks, without_block
 from egopose.data.store import TakeStore
 from egopose.envs.mdp.observations import humanoid_state
@@ -28,6 +29,15 @@ from egopose.pipeline.regressor import kept_tables, load_regressor, regressor_na
 from egopose.training import blended_regressor as blending
 from egopose.training.blended_regressor import KernelSettings, choose_shares, fit_kernels, share_groups, window_table
 from egopose.vision.encoders import LightFlowEncoder
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("blended")
+    prepare(configuration(folder), progress=False, flow=False)
+    fill_flow(configuration(folder))
+    return folder
+
 
 LOOKAHEAD = 3
 

@@ -397,7 +397,7 @@ def test_a_run_learns_keeps_and_reads_back_networks_and_kernel(
     there = [name for name in PARTS if has_component(run / FOLDER, name)]
     assert there == ["members", "kernel", "sizes"]
     _copy_components(run / FOLDER, shipped / FOLDER, there)
-    assert not has_component(shipped / FOLDER, "futures")
+    assert not has_component(shipped / FOLDER, "forecasts")
     assert torch.equal(ForecastCurves(config, dataset, shipped)(pasts), told)
     afresh = with_forecasts(config, dataset, shipped).forecasts
     assert afresh is not None

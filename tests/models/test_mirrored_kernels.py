@@ -18,7 +18,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from egopose.checkpoint import pretrained as weights
 from egopose.checkpoint.body_parts import load_body_part_estimator
 from egopose.checkpoint.checkpoint import read_json
 from egopose.core.config import from_mapping
@@ -203,7 +202,7 @@ def test_a_finder_read_back_mirrors_as_before(
     model.mean.normal_()
     model.std.uniform_(0.1, 2.0)
     save_body_part_estimator(tmp_path / "kept", model, humanoid.skeleton, FlowConfig("fast", 64, 32), {}, 1)
-    monkeypatch.setattr(weights, "FOLDER", tmp_path)
+    monkeypatch.setattr("egopose.checkpoint.body_parts.FOLDER", tmp_path)
     again = load_body_part_estimator.__wrapped__("kept")
     assert torch.equal(again.mirror_index, mirror.index)
     assert torch.equal(again.mirror_sign, mirror.sign)
@@ -226,7 +225,7 @@ def mirrored_clip(flow: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("cells", [2, 3])
 @pytest.mark.parametrize("limbs", [None, "body_parts"])
 def test_the_table_of_the_mirror_image_is_the_table_of_the_mirrored_clip(limbs: str | None, cells: int) -> None:
-    chosen, draw = replace(SETTINGS, limbs=limbs, cells=cells), np.random.default_rng(5)
+    chosen, draw = replace(SETTINGS, body_parts=limbs, cells=cells), np.random.default_rng(5)
     flow = draw.normal(size=(40, 2, 14, 14)).astype(np.float32)
     image = mirrored_clip(flow)
     if limbs is not None:

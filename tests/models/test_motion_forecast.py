@@ -21,6 +21,7 @@ from helpers.forecast_curves import (
     unmirrored,
     wave,
 )
+from helpers.humanoid_stand_in import reference_motion, stand_in
 from hypothesis import given
 from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
@@ -45,6 +46,14 @@ from egopose.pipeline.networks import build_networks
 from egopose.tasks.dataset import Dataset
 from egopose.training.fitting import FitSettings, fit
 from egopose.training.motion_forecast import ForecastLearner, build_forecaster, cross_fit_starts
+
+
+@pytest.fixture(scope="module")
+def dataset() -> Dataset:
+    humanoid: Any = stand_in()
+    reference, takes = reference_motion(humanoid)
+    states = humanoid_state(reference).float()
+    return Dataset(humanoid, reference, takes, PIECES, PIECES, states=states)
 
 
 def test_splines_hold_cubics_and_their_slopes() -> None:

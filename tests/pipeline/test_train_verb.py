@@ -10,7 +10,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from helpers.train_command import command, start
+from helpers.train_command import (
+    command,
+    launcher,
+    start,
+)
 from helpers.waiting import PATIENCE, wait_until
 from omegaconf import OmegaConf
 
@@ -20,6 +24,8 @@ from egopose.collection.collectors import CollectorSettings
 from egopose.core.config import compose_config, convert, from_mapping, resolved, run_directory
 from egopose.core.errors import InputError
 from egopose.training.ppo import PPOSettings
+
+__all__ = ["launcher"]  # a fixture
 
 
 def composed(*overrides: str) -> dict[str, Any]:

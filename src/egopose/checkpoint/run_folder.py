@@ -7,5 +7,5 @@ forecast: a policy must not trust them more than it may on new takes.
 from __future__ import annotations
 
 FOLDER = "forecaster"
-#: Components of that folder that forecasts are made by; ``futures`` are those of the training frames.
+#: Components of that folder that forecasts are made by; ``forecasts`` are those of the training frames.
 PARTS = ("members", "kernel", "sizes", "continued")
