@@ -8,6 +8,7 @@ from typing import Any
 
 from egopose.core.config import from_mapping
 from egopose.core.errors import InputError
+from egopose.envs.mdp.rewards import build_reward
 
 
 @dataclass(frozen=True)
@@ -70,8 +71,13 @@ class PlannerSettings:
         for name in ("recovery_rounds", "acceleration", "head", "margin", "tie_tolerance"):
             check(getattr(self, name) >= 0, name, "must not be negative")
         check(0 < self.discount <= 1, "discount", "must lie in (0, 1]")
-        kind = self.reward.get("kind") if isinstance(self.reward, Mapping) else None
-        check(kind == "heading_frame", "reward", "must be one in the heading frame")
+        check(isinstance(self.reward, Mapping) and "terms" in self.reward, "reward", "must be a file of conf/reward")
+        try:
+            table = build_reward(self.reward)
+        except ValueError as error:
+            raise InputError("planner", "reward", str(error)) from None
+        # What is followed knows no place in the world, and a plan is judged by nothing but the body.
+        check(not table.in_world and not table.needs, "reward", "must be of the body alone, in the heading frame")
 
 
 def planned_threshold(settings: PlannerSettings | None) -> float | None:

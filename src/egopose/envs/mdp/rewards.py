@@ -31,11 +31,13 @@ class Term:
         function: ``function(view, *, scale, ...) -> [N]``.
         reads: attributes of :class:`~egopose.envs.mdp.observations.BodyView` it reads of body and reference.
         needs: the :data:`PARTS` of the view it reads.
+        in_world: whether it changes where body and reference stand elsewhere or face another way.
     """
 
     function: Callable[..., Tensor]
     reads: tuple[str, ...]
     needs: tuple[str, ...]
+    in_world: bool
 
 
 #: Every term there is, by name.
@@ -43,7 +45,7 @@ TERMS: dict[str, Term] = {}
 
 
 def reward_term(
-    *, reads: tuple[str, ...] = (), needs: tuple[str, ...] = ()
+    *, reads: tuple[str, ...] = (), needs: tuple[str, ...] = (), in_world: bool = False
 ) -> Callable[[Callable[..., Tensor]], Callable[..., Tensor]]:
     """Register a function as the term of its name; see :class:`Term`.
 
@@ -58,7 +60,7 @@ def reward_term(
             raise ValueError(f"there is a reward term {name!r} already, of {known.function.__module__}")
         if unknown := set(needs) - set(PARTS):
             raise ValueError(f"a reward term can need {', '.join(PARTS)}, not {sorted(unknown)[0]!r}")
-        TERMS[name] = Term(function, reads, needs)
+        TERMS[name] = Term(function, reads, needs, in_world)
         return function
 
     return register
@@ -118,7 +120,7 @@ def forecasting_decay(step: Tensor, horizon: int) -> Tensor:
     return ((horizon - step) / horizon).clamp_min(0.0)
 
 
-@reward_term(reads=("joint_rotations", "root_quaternion"))
+@reward_term(reads=("joint_rotations", "root_quaternion"), in_world=True)
 def world_pose(view: StepView, *, scale: float, metric: str) -> Tensor:
     """DeepMimic's r^p = exp(-2 sum_j |q_j - q^_j|^2), the root's world rotation among the joints ``[N]``."""
     joints = rotation_distance(view.body.joint_rotations, view.reference.joint_rotations, metric)
@@ -132,13 +134,13 @@ def joint_velocity(view: StepView, *, scale: float) -> Tensor:
     return torch.exp(-scale * _squares(view.body.joint_velocities, view.reference.joint_velocities))
 
 
-@reward_term(reads=("end_effector_positions",))
+@reward_term(reads=("end_effector_positions",), in_world=True)
 def world_end_effector(view: StepView, *, scale: float) -> Tensor:
     """DeepMimic's r^e = exp(-40 sum_e |p_e - p^_e|^2), world positions ``[N]``."""
     return torch.exp(-scale * _squares(view.body.end_effector_positions, view.reference.end_effector_positions))
 
 
-@reward_term(reads=("centre_of_mass",))
+@reward_term(reads=("centre_of_mass",), in_world=True)
 def centre_of_mass(view: StepView, *, scale: float) -> Tensor:
     """DeepMimic's r^c = exp(-10 |p_c - p^_c|^2), world positions ``[N]``."""
     return torch.exp(-scale * _squares(view.body.centre_of_mass, view.reference.centre_of_mass))
@@ -185,6 +187,11 @@ class RewardTable:
     def reads(self) -> tuple[str, ...]:
         """Attributes of :class:`~egopose.envs.mdp.observations.BodyView` that some term reads, each once."""
         return tuple(dict.fromkeys(name for term in self.weights for name in TERMS[term].reads))
+
+    @property
+    def in_world(self) -> tuple[str, ...]:
+        """The terms that depend on where the body stands and faces; none where all is in the heading frame."""
+        return tuple(term for term in self.weights if TERMS[term].in_world)
 
     @property
     def needs(self) -> frozenset[str]:
