@@ -21,7 +21,7 @@ STUDY = Path(__file__).resolve().parents[2] / "experiments" / "study"
 def study_on_path(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     monkeypatch.syspath_prepend(str(STUDY))
     yield
-    for name in ("study", "tables", "aids_table"):
+    for name in ("study", "tables"):
         sys.modules.pop(name, None)
 
 
@@ -97,14 +97,14 @@ def test_a_row_has_a_budget_of_its_own_and_may_judge_survival() -> None:
 
     before = {job.name: job.fingerprint for job in list_jobs(small())}
     study = small()
-    study["folds"]["aids"] = {"a": {"overrides": []}}
-    row = {"table": "u", "protocols": ["aids"], "methods": ["ours"], "seeds": [0], "budget": 40, "survival": True}
+    study["folds"]["easier"] = {"a": {"overrides": []}}
+    row = {"table": "u", "protocols": ["easier"], "methods": ["ours"], "seeds": [0], "budget": 40, "survival": True}
     study["tables"].append(row)
     jobs = {job.name: job for job in list_jobs(study)}
-    own = jobs.pop("ours-aids-a-seed0")
+    own = jobs.pop("ours-easier-a-seed0")
     assert {name: job.fingerprint for name, job in jobs.items()} == before
     assert own.overrides == ("data=default", "x=1", "training.total_steps=40", "seed=0")
-    assert own.run == "ours-aids-a-seed0"
+    assert own.run == "ours-easier-a-seed0"
     assert own.survival
     row["survival"] = False
     assert list_jobs(study)[-1].fingerprint != own.fingerprint
@@ -221,31 +221,3 @@ def test_results_of_other_takes_or_smaller_budgets_are_not_compared(tmp_path: Pa
     (tmp_path / "table1_estimation" / "raw" / "vgail-a-0.json").write_text('{"overrides": []}')
     with pytest.raises(InputError, match="damaged"):
         write_tables(tmp_path)
-
-
-def test_the_table_of_aids_compares_the_same_episodes(tmp_path: Path) -> None:
-    from aids_table import TABLE, gather, table, write_table
-
-    def raw(method: str, frames: list[int], budget: int = 40) -> None:
-        path = tmp_path / TABLE / "raw" / f"{method}-{budget}.json"
-        path.parent.mkdir(parents=True, exist_ok=True)
-        figures = {name: [1.0, 3.0] for name in ("E_pose", "E_vel", "A_accl")}
-        survival = {"policy": frames, "base_tracking": [5] * len(frames), "reference_tracking": [8] * len(frames)}
-        about = {"method": method, "seed": 0, "overrides": [f"training.total_steps={budget}"], "takes": ["a", "b"]}
-        about |= {"figures": figures, "resets": [1, 2], "frames": [900, 900], "survival": survival}
-        path.write_text(json.dumps(about))
-
-    raw("ours", [10, 20, 30])
-    raw("assist", [14, 24, 34])
-    lines = table(gather(tmp_path / TABLE))
-    assert any("assisting wrench | 24.0" in line and "+4.0 [+4.0, +4.0] | 2.000" in line for line in lines)
-    assert any(line.endswith("| 3.0 |") for line in lines)
-    assert any("zero action" in line and "| -15.0 [" in line for line in lines)
-    write_table(tmp_path)
-    assert "40 control steps" in (tmp_path / TABLE / "README.md").read_text()
-    raw("assist", [14, 24])
-    with pytest.raises(InputError, match="other episodes"):
-        table(gather(tmp_path / TABLE))
-    (tmp_path / TABLE / "raw" / "broken.json").write_text("{}")
-    with pytest.raises(InputError, match="damaged"):
-        gather(tmp_path / TABLE)
