@@ -14,7 +14,8 @@ from egopose.envs.mdp.rewards import RewardTable
 from egopose.envs.mdp.step_view import StepView
 from egopose.humanoid.model import HumanoidModel
 
-#: Of a body state, batch ``[N]``, float64: see docs/architecture.md.
+#: Of a body state, batch ``[N]``, float64: ``qpos [N, nq]``, ``qvel [N, nv]``, ``xpos [N, B, 3]`` m and ``xquat [N, B, 4]`` of
+#: the bodies in the world, ``com [N, 3]`` m. A reference has the same keys, and ``com_vel [N, 3]`` m/s.
 BODY_KEYS = ("qpos", "qvel", "xpos", "xquat", "com")
 #: Of what an environment writes: which row of what is followed each body should be in, ``[N]`` int64.
 Rows = Callable[[Mapping[str, Tensor]], Tensor]
