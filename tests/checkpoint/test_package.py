@@ -124,10 +124,11 @@ def test_a_wrong_name_is_told_the_right_ones(name: str, said: str) -> None:
 
 def test_the_former_prefix_is_still_read() -> None:
     assert find_checkpoint(f"weights:{NAME}") == find_checkpoint(f"pretrained:{NAME}")
-    assert weights.is_pretrained(f"weights:{NAME}") and weights.is_pretrained(f"pretrained:{NAME}")
+    assert weights.is_pretrained(f"weights:{NAME}")
+    assert weights.is_pretrained(f"pretrained:{NAME}")
     assert not weights.is_pretrained(f"runs/pretrained:{NAME}")
     assert data_at("/data", f"weights:{NAME}", "best") == data_at("/data", f"pretrained:{NAME}", "best")
-    with pytest.raises(InputError, match="weights:cmu6_estimaton.*did you mean pretrained:cmu6_estimation"):
+    with pytest.raises(InputError, match=r"weights:cmu6_estimaton.*did you mean pretrained:cmu6_estimation"):
         find_checkpoint("weights:cmu6_estimaton")
 
 
