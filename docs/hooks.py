@@ -27,7 +27,8 @@ API = {
     "vision": "video flow lens camera_rotation features encoders rendering rooms takes body_parts body_part_pictures",
     "data": "take_sources preparation prepare_motion sync_offset store splits feasibility gate",
     "models": "policy context episode_context regressor pose_regression predictions mirror",
-    "envs": "imitation problem env dm_control_task starts transforms mdp.observations mdp.rewards mdp.step_view mdp.terminations",
+    "envs": "imitation problem env dm_control_task starts transforms "
+    "mdp.observations mdp.rewards mdp.step_view mdp.terminations",
     "tasks": "task dataset",
     "collection": "collectors",
     "checkpoint": "checkpoint pretrained body_parts",

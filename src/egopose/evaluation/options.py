@@ -12,7 +12,7 @@ from egopose.core.errors import InputError
 
 
 def output_folder(out: str | None, checkpoint: Path, split: str) -> Path:
-    """Where results go: ``out``, or ``RUN/evaluation/SPLIT``, or ``evaluation/NAME/SPLIT`` here for ``pretrained:NAME``.
+    """Where results go: ``out``, or ``RUN/evaluation/SPLIT``; ``evaluation/NAME/SPLIT`` here for ``pretrained:NAME``.
 
     Raises:
         InputError: ``out`` lies inside the checkpoint, whose files are sealed by checksums.
