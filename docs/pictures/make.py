@@ -1,8 +1,12 @@
 """Draw the pictures of the docs from the program itself: ``python docs/pictures/make.py``.
 
-All are made of clips that come with the package. CMU 07_04, a walk: the body driven by PD alone beside the mocap, and
-the wearer's rendered view with its optical flow. CMU 07_05, a walk: what the pretrained weights make of the rendered video.
-DeepMimic's cartwheel: how fast head and camera turn. One more picture shows the way of the data through the program.
+All are made of clips that come with the package:
+
+- CMU 07_04, a walk: the body driven by PD alone beside the mocap, and the rendered view with its optical flow.
+- CMU 07_05, a walk: what the pretrained weights make of the rendered video.
+- DeepMimic's cartwheel: how fast head and camera turn.
+
+One more picture shows the way of the data through the program.
 """
 
 from __future__ import annotations

@@ -14,8 +14,9 @@ from egopose.envs.mdp.rewards import RewardTable
 from egopose.envs.mdp.step_view import StepView
 from egopose.humanoid.model import HumanoidModel
 
-#: Of a body state, batch ``[N]``, float64: ``qpos [N, nq]``, ``qvel [N, nv]``, ``com [N, 3]`` m, and of the bodies in the
-#: world ``xpos [N, B, 3]`` m and ``xquat [N, B, 4]``. A reference has the same keys, and ``com_vel [N, 3]`` m/s.
+#: Keys of a body state, batch ``[N]``, float64: ``qpos [N, nq]``, ``qvel [N, nv]`` and ``com [N, 3]`` m of the body,
+#: ``xpos [N, B, 3]`` m and ``xquat [N, B, 4]`` of its parts in the world. A reference has the same keys, and
+#: ``com_vel [N, 3]`` m/s.
 BODY_KEYS = ("qpos", "qvel", "xpos", "xquat", "com")
 #: From what an environment writes to the row of the target motion that each body should be in, ``[N]`` int64.
 Rows = Callable[[Mapping[str, Tensor]], Tensor]

@@ -97,9 +97,9 @@ class FailSafe:
     def update(self, value: Tensor, head_height: Tensor, active: Tensor) -> Tensor:
         """Record a frame and say which worlds must be reset.
 
-        Every frame of the take counts in the mean, this one and those that triggered included, so that a stretch the
-        value network rates low throughout ends in a lower bar and not in a reset at every frame. A mean that is not
-        positive says nothing of a drop, and nothing triggers then.
+        Every frame of the take counts in the mean, also this one and those that triggered. So a stretch with low values
+        throughout lowers the threshold, and does not reset the body at every frame. A mean that is not positive says
+        nothing of a drop, and nothing triggers then.
 
         Args:
             value: ``[N]`` V(s_t).
