@@ -23,16 +23,18 @@ NOTEBOOK = "notebooks/first_look.ipynb"
 #: Rooms of the package and the modules of each whose public names others build on.
 API = {
     "motion": "motion rotations skeleton kinematics mapping retarget contacts ground io",
-    "humanoid": "config model from_motion physics",
+    "humanoid": "config model from_motion physics boxes state_layout",
     "vision": "video flow lens camera_rotation features encoders rendering rooms takes body_parts body_part_pictures",
     "data": "take_sources preparation prepare_motion sync_offset store splits feasibility gate",
     "models": "policy context episode_context regressor pose_regression predictions mirror",
-    "envs": "build problem env dm_control_task starts transforms mdp.observations mdp.rewards mdp.terminations",
+    "envs": "imitation problem env dm_control_task starts transforms "
+    "mdp.observations mdp.rewards mdp.step_view mdp.terminations",
+    "tasks": "task dataset",
     "collection": "collectors",
-    "checkpoint": "checkpoint body_parts",
+    "checkpoint": "checkpoint pretrained body_parts",
     "training": "loop ppo regressor body_parts survival",
-    "pipeline": "agent dataset environment",
-    "inference": "estimator failsafe forecaster bands",
+    "pipeline": "agent dataset environment run",
+    "inference": "estimator failsafe forecaster planner bands",
     "evaluation": "metrics position_metrics protocols statistics agents",
 }
 

@@ -1,11 +1,17 @@
 """Draw the pictures of the docs from the program itself: ``python docs/pictures/make.py``.
 
-Of clips that ship with the package: CMU 07_04, a walk, with the body driven by PD alone beside the mocap, and the
-wearer's rendered view with its optical flow; DeepMimic's cartwheel, how head and camera turn. And the way data take.
+All are made of clips that come with the package:
+
+- CMU 07_04, a walk: the body driven by PD alone beside the mocap, and the rendered view with its optical flow.
+- CMU 07_05, a walk: what the pretrained weights make of the rendered video.
+- DeepMimic's cartwheel: how fast head and camera turn.
+
+One more picture shows the way of the data through the program.
 """
 
 from __future__ import annotations
 
+import tempfile
 from importlib.resources import files
 from pathlib import Path
 
@@ -13,6 +19,7 @@ import cv2
 import matplotlib
 import mujoco
 import numpy as np
+from PIL import Image
 
 from egopose.core.config import compose_config
 from egopose.data.gate import LEAD
@@ -22,19 +29,23 @@ from egopose.data.reference import reference_states
 from egopose.data.sync_offset import head_turning
 from egopose.humanoid.model import HumanoidModel
 from egopose.humanoid.physics import BatchedPhysics
+from egopose.inference.video import estimate_video
 from egopose.motion.io import read_motion
 from egopose.motion.motion import Motion
 from egopose.vision.camera_rotation import camera_rotation
 from egopose.vision.flow import FlowConfig, flow_image, flow_of_frames
 from egopose.vision.rendering import SceneRenderer, wearer_frames
 from egopose.vision.rooms import room_seed
+from egopose.vision.side_by_side import side_by_side
 from egopose.vision.takes import RenderConfig
+from egopose.vision.video import write_video
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 
 HERE = Path(__file__).resolve().parent
 CLIPS = Path(str(files("egopose") / "assets" / "clips"))
+PRETRAINED = "pretrained:cmu6_estimation"
 SHOWN = (12, 16, 20, 24)  # frames of the clip, 1/30 s each: steps of the walk
 
 
@@ -90,6 +101,22 @@ def seen(humanoid: HumanoidModel, clip: Motion) -> None:
     save("wearers_view.jpg", np.concatenate([views, flows]))
 
 
+def estimated(humanoid: HumanoidModel, clip: Motion) -> None:
+    """A moving picture: the mocap, what the pretrained weights estimate from the video, and the rendered video."""
+    frames, _ = filmed(humanoid, clip, 256)
+    with tempfile.TemporaryDirectory() as folder:
+        video = Path(folder) / "wearer.mp4"
+        write_video(video, frames, 30.0)
+        out = estimate_video(compose_config("estimate", [f"video={video}", f"checkpoint={PRETRAINED}"]))
+        found = read_motion(out / "estimate.npz")
+    motions = {"motion capture": clip.qpos, "estimate": found.qpos}
+    panels = side_by_side(humanoid.mj_model, motions, frames, "rendered video", 240)
+    pictures = [Image.fromarray(panel) for panel in list(panels)[:100:2]]
+    pictures[0].save(
+        HERE / "estimate.webp", save_all=True, append_images=pictures[1:], duration=67, loop=0, quality=70, method=6
+    )
+
+
 def turning(humanoid: HumanoidModel, clip: Motion) -> None:
     """How fast head and camera turn."""
     _, flow = filmed(humanoid, clip, 128)
@@ -109,7 +136,7 @@ def way() -> None:
     boxes = {
         "motion files\nBVH AMC npz": (0.0, 1.0),
         "wearer's MP4": (0.0, 0.0),
-        "retarget, settle\non the floor": (1.0, 1.0),
+        "retarget, align\nto the floor": (1.0, 1.0),
         "optical flow": (1.0, 0.0),
         "take store": (2.0, 0.5),
         "state regressor F\n(video to state)": (3.0, 0.0),
@@ -139,12 +166,13 @@ def way() -> None:
 def main() -> None:
     """All of them."""
     humanoid = humanoid_of(compose_config("prepare"))
-    walk, wheel = (
+    walk, longer, wheel = (
         reference_motion(read_motion(CLIPS / f"{name}.motion.npz"), humanoid)[0]
-        for name in ("cmu07_04", "deepmimic_cartwheel")
+        for name in ("cmu07_04", "cmu07_05", "deepmimic_cartwheel")
     )
     bodies(humanoid, walk)
     seen(humanoid, walk)
+    estimated(humanoid, longer)
     turning(humanoid, wheel)
     way()
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import re
 from pathlib import Path
 
 import egopose
@@ -72,6 +73,14 @@ def test_no_import_goes_up() -> None:
             if above > rank or (room, room_of(other)) in APART:
                 up.append(f"{module} -> {other}")
     assert not up, "\n".join(up)
+
+
+def test_the_page_lists_the_rooms_in_order() -> None:
+    page = (Path(__file__).resolve().parents[2] / "docs" / "architecture.md").read_text(encoding="utf8")
+    rows = re.findall(r"^\| (`[^|]*`) \|", page.partition("| room |")[2].partition("\n\n")[0], re.MULTILINE)
+    told = [room for row in rows for room in re.findall(r"`(\w+)`", row)]
+    assert told == list(ROOMS)
+    assert len(page.splitlines()) <= 80
 
 
 def test_no_import_circle() -> None:

@@ -115,11 +115,21 @@ def test_damage_is_refused_by_the_files_name(which: str, tmp_path: Path, monkeyp
 
 
 @pytest.mark.parametrize(
-    ("name", "said"), [("cmu6_estimaton", "did you mean weights:cmu6"), ("x", f"there are .*{NAME}")]
+    ("name", "said"), [("cmu6_estimaton", "did you mean pretrained:cmu6"), ("x", f"there are .*{NAME}")]
 )
 def test_a_wrong_name_is_told_the_right_ones(name: str, said: str) -> None:
     with pytest.raises(InputError, match=said):
         find_checkpoint(f"{weights.PREFIX}{name}")
+
+
+def test_the_former_prefix_is_still_read() -> None:
+    assert find_checkpoint(f"weights:{NAME}") == find_checkpoint(f"pretrained:{NAME}")
+    assert weights.is_pretrained(f"weights:{NAME}")
+    assert weights.is_pretrained(f"pretrained:{NAME}")
+    assert not weights.is_pretrained(f"runs/pretrained:{NAME}")
+    assert data_at("/data", f"weights:{NAME}", "best") == data_at("/data", f"pretrained:{NAME}", "best")
+    with pytest.raises(InputError, match=r"weights:cmu6_estimaton.*did you mean pretrained:cmu6_estimation"):
+        find_checkpoint("weights:cmu6_estimaton")
 
 
 def test_a_path_that_was_overlooked_is_refused(run: Path, tmp_path: Path) -> None:
@@ -164,9 +174,9 @@ def test_results_of_shipped_weights_go_beside_the_user_and_data_may_lie_elsewher
     )
 
 
-@pytest.mark.parametrize("name", weights.shipped_names())
+@pytest.mark.parametrize("name", weights.pretrained_names())
 def test_what_ships_is_whole_small_and_on_its_card(name: str) -> None:
-    folder = weights.shipped_run(name)
+    folder = weights.pretrained_run(name)
     card = (ROOT / "docs" / "model-card.md").read_text()
     assert (weights.FOLDER / "MODEL_CARD.md").read_text() == card
     assert (folder / "figures.md").read_text() in card

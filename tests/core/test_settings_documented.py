@@ -10,6 +10,7 @@ import pytest
 import yaml
 
 from egopose.core.verbs import VERBS
+from egopose.envs.mdp.rewards import TERMS
 
 ROOT = Path(__file__).resolve().parents[2]
 CONF = ROOT / "conf"
@@ -64,6 +65,13 @@ def test_the_docs_tell_of_every_choice_of_trainings_groups() -> None:
         there = {path.stem for path in (CONF / group).glob("*.yaml")}
         told = set(re.findall(r"`(\w+)`", groups[group]))
         assert told == there, group
+
+
+def test_the_docs_tell_of_every_reward_term() -> None:
+    page = (ROOT / "docs" / "howto-train.md").read_text()
+    table = page.partition("| term | compares")[2].partition("\n\n")[0]
+    own = {name for name, term in TERMS.items() if term.function.__module__.startswith("egopose.")}
+    assert set(re.findall(r"^\| `(\w+)` \|", table, re.MULTILINE)) == own
 
 
 def test_rates_in_the_docs_are_the_configurations() -> None:

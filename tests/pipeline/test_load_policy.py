@@ -25,7 +25,7 @@ from egopose.pipeline.run import build_run
 from egopose.training.loop import train
 
 
-@pytest.mark.parametrize("name", weights.shipped_names())
+@pytest.mark.parametrize("name", weights.pretrained_names())
 def test_shipped_policies_load_without_data(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(datasets, "prepare", lambda *_: pytest.fail("data is prepared"))
     path = f"{weights.PREFIX}{name}"

@@ -19,22 +19,22 @@ from egopose.vision.body_parts import BodyPartEstimator
 
 @functools.cache
 def load_body_part_estimator(name: str) -> BodyPartEstimator:
-    """A finder that comes with the package, in evaluation mode.
+    """A body-part estimator that comes with the package, in evaluation mode.
 
     Args:
         name: of its folder in ``egopose/weights``.
 
     Raises:
-        InputError: there is no such finder, or a file of it is damaged.
+        InputError: there is none of that name, or a file of it is damaged.
     """
     folder = FOLDER / name
-    # A name from a stranger's configuration must not lead out of the package.
+    # A name from an untrusted configuration must not lead out of the package.
     if folder.parent != FOLDER or name in (".", "..") or not (folder / "manifest.json").is_file():
-        raise InputError("regressor.kernel", "limbs", f"no limb finder {name!r} comes with egopose")
+        raise InputError("regressor.kernel", "body_parts", f"no body-part estimator {name!r} comes with egopose")
     config = read_json(folder, "config")
     finder = BodyPartEstimator(len(config["names"]), int(config["channels"]))
     if "mirror" not in config:
-        raise InputError(folder, "mirror", "is missing: the finder was made by an older egopose")
+        raise InputError(folder, "mirror", "is missing: the estimator was made by an older egopose")
     for key, buffer in (("index", finder.mirror_index), ("sign", finder.mirror_sign)):
         buffer.copy_(torch.tensor(config["mirror"][key]))
     RunCheckpoint({"finder": finder}).restore(folder, {"finder"})

@@ -25,7 +25,7 @@ from torchrl.checkpoint import Checkpoint, CheckpointError, CheckpointRotation
 
 from egopose import __version__
 from egopose.checkpoint.checksums import _files, check_files, seal
-from egopose.checkpoint.pretrained import is_shipped, shipped_run
+from egopose.checkpoint.pretrained import is_pretrained, pretrained_run
 from egopose.core import safe_io
 from egopose.core.errors import InputError
 from egopose.core.former_names import upgraded
@@ -245,13 +245,13 @@ def find_checkpoint(path: str | Path, which: str = "latest") -> Path:
     """A whole checkpoint folder from a run directory (its ``latest`` or ``best``), or the folder ``path`` itself.
 
     In a run directory a damaged one is passed over, with a line on standard error, for the one before it. Of weights
-    that come with the package, ``weights:NAME``, there is one.
+    that come with the package, ``pretrained:NAME``, there is one.
 
     Raises:
         InputError: there is no such run directory, or it holds no checkpoint yet, or none that is whole.
     """
-    if is_shipped(path):
-        return find_checkpoint(shipped_run(str(path)))
+    if is_pretrained(path):
+        return find_checkpoint(pretrained_run(str(path)))
     folder = Path(path)
     if (folder / "manifest.json").is_file():
         return folder

@@ -54,9 +54,9 @@ class CollectorSettings:
         workers: processes, each with an environment of its own.
         threads: torch threads while collecting; physics has threads of its own.
         update_threads: torch threads while the networks are updated.
-        env_groups: parts of the worlds of ``sync`` that take turns, see
-            :class:`egopose.collection.env_groups.GroupedCollector`; 1 to step all at once, None for two from
-            ``env_groups_from`` steps of physics a control step on: below, taking turns costs more than it hides.
+        env_groups: groups of environments of ``sync`` that take turns, see
+            :class:`egopose.collection.env_groups.GroupedCollector`. 1 steps all at once. None is 2 from
+            ``env_groups_from`` physics steps a control step on, where turns cost less than they hide, and 1 below.
         env_groups_from: see ``env_groups``.
         address: of the Ray cluster, see :class:`egopose.collection.workers.Workers`.
         fast: of ``sync``: False collects by TorchRL's own rollout, with the same numbers at more expense.
@@ -103,7 +103,7 @@ def build_collector(
     policy: TensorDictModuleBase,
     steps_per_iteration: int,
 ) -> Collector | Workers:
-    """A collector that never ends; one iteration gives ``steps_per_iteration`` control steps over all worlds.
+    """An endless collector; one iteration gives ``steps_per_iteration`` control steps over all environments.
 
     ``make_env`` gets the worker's number, to seed by. ``sync`` takes the quick path (:mod:`egopose.collection`) unless
     ``settings.fast`` is off. It warns where a policy without a memory cannot be called in that way, with the reason.
@@ -187,9 +187,9 @@ def load_transform_state(collector: Any, state: Mapping[str, Any]) -> None:
 
 
 def simulation_state(collector: Any) -> dict[str, Any]:
-    """Where every world stands: the base environment's own state and what the policy will see next.
+    """The state of every environment: the base environment's own, and the policy's next observation.
 
-    With workers, of each at the end of its last batch.
+    With workers, that of each at the end of its last batch.
     """
     if isinstance(collector, Workers):
         return {f"worker{number}": state for number, state in enumerate(collector.simulation)}

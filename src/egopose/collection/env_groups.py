@@ -1,4 +1,4 @@
-"""A collector that keeps all cores busy: while the physics steps some worlds, the policy looks at the others."""
+"""A collector that keeps all cores busy: while the physics steps some environments, the policy acts for the others."""
 
 from __future__ import annotations
 
@@ -23,16 +23,16 @@ _TURN = (
 
 
 class GroupedCollector(Collector):
-    """TorchRL's collector for small worlds, stepped in ``env_groups`` that take turns.
+    """TorchRL's collector for small environments, stepped in groups that take turns.
 
-    With all worlds in step the physics' threads wait while the policy acts and the policy waits while they step. Here a
-    lane's physics runs while another lane's observations, actions and resets are worked out, in a fixed order: what
-    comes out does not depend on timing. Each lane's step counts in the running normaliser when it is made.
+    If all environments step together, the physics' threads wait for the policy and the policy waits for them. Here the
+    physics of one group runs while observations, actions and resets of another are computed. The order is fixed, so the
+    result does not depend on timing. Each group's step enters the running normaliser when it is made.
 
     Args:
-        env: whose worlds are parted.
+        env: the environments that are divided into groups.
         policy: without a memory, see :meth:`GaussianSampler.needs_tensordicts`.
-        env_groups: how many.
+        env_groups: number of groups.
         **settings: of TorchRL's collector.
     """
 
@@ -43,26 +43,26 @@ class GroupedCollector(Collector):
         if settings.get("exploration_type", ExplorationType.RANDOM) != ExplorationType.RANDOM:
             raise ValueError("actions are drawn at random here")
         bounds = [env.batch_size[0] * number // env_groups for number in range(env_groups + 1)]
-        self._lanes = [slice(*ends) for ends in pairwise(bounds)]
+        self._groups = [slice(*ends) for ends in pairwise(bounds)]
 
     def rollout(self) -> TensorDictBase:
         """``[N, T]``: the next T steps of every world."""
-        seen = [Entries(self._carrier[worlds].items()) for worlds in self._lanes]
+        seen = [Entries(self._carrier[worlds].items()) for worlds in self._groups]
         with _quick_turns(), torch.inference_mode():
             batch, follows = self._steps(seen)
         for key in set(follows[0]) & set(self._carrier.keys()):
-            # Outside: what is made in inference mode cannot be learned from.
-            self._carrier.set(key, torch.cat([lane[key] for lane in follows]))
+            # Outside of inference mode, whose tensors cannot be learned from.
+            self._carrier.set(key, torch.cat([group[key] for group in follows]))
         return batch
 
     def _steps(self, standing: list[Entries]) -> tuple[TensorDict, list[Entries]]:
-        """From what each lane sees: the batch ``[N, T]``, and what each lane sees after it."""
-        columns = [_Columns(worlds, self.frames_per_batch) for worlds in self._lanes]
+        """From the observations of each group: the batch ``[N, T]``, and the observations after it."""
+        columns = [_Columns(worlds, self.frames_per_batch) for worlds in self._groups]
         batch: TensorDict | None = None
-        for seen, worlds in zip(standing, self._lanes, strict=True):
+        for seen, worlds in zip(standing, self._groups, strict=True):
             self._begin(seen, worlds)
         for left in range(self.frames_per_batch - 1, -1, -1):
-            for number, worlds in enumerate(self._lanes):
+            for number, worlds in enumerate(self._groups):
                 seen = standing[number]
                 after, standing[number] = self.env.end_step(seen, worlds)
                 if left:
@@ -79,14 +79,14 @@ class GroupedCollector(Collector):
 
 
 class _Columns:
-    """Puts a lane's steps into the batch, some at a time, while the physics goes on."""
+    """Puts the steps of a group into the batch, several at a time, while the physics goes on."""
 
     def __init__(self, worlds: slice, steps: int) -> None:
         self._worlds, self._steps, self._put = worlds, steps, 0
         self._waiting: list[tuple[Entries, Entries]] = []
 
     def append(self, seen: Entries, after: Entries, batch: TensorDict) -> None:
-        """What was seen and done, and what came of it."""
+        """One step: observation and action, and the result."""
         self._waiting.append((seen, after))
         end = self._put + len(self._waiting)
         if len(self._waiting) < _STEPS_PUT_AT_ONCE and end < self._steps:
@@ -101,7 +101,7 @@ class _Columns:
 
 
 def _empty_batch(seen: Entries, after: Entries, num_envs: int, steps: int) -> TensorDict:
-    """Room for ``[worlds, steps]`` of what is seen and done, and under ``next`` of what came of it."""
+    """Room for ``[num_envs, steps]`` of observations and actions, and under ``next`` of their results."""
     size = torch.Size([num_envs, steps])
     with torch.inference_mode(False):  # to be learned from
         first, then = (
@@ -115,8 +115,8 @@ def _empty_batch(seen: Entries, after: Entries, num_envs: int, steps: int) -> Te
 def _quick_turns() -> Iterator[None]:
     """Python's threads give way to each other within microseconds.
 
-    A physics thread needs the interpreter for a moment after every world. By default it would get it only when the
-    thread that acts has to wait: up to 5 ms on an idle core.
+    A physics thread needs the interpreter for a moment after every environment. By default it gets it only when the
+    acting thread has to wait: up to 5 ms on an idle core.
     """
     before = sys.getswitchinterval()
     sys.setswitchinterval(_TURN)

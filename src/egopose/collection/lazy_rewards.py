@@ -1,4 +1,4 @@
-"""What acting does not need is worked out for a whole batch, not at every step while the physics' cores wait."""
+"""Rewards and log-probabilities are computed once per batch, not per step while the physics' cores wait."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ from egopose.collection.stepping import TransformedEgoPoseEnv, parts_of, run_par
 
 
 class GaussianSampler(TensorDictModuleBase):
-    """Draws a Gaussian actor's actions, the same ones from the same random numbers, without their probabilities.
+    """Draws a Gaussian actor's actions without their probabilities: the same actions from the same random numbers.
 
-    Writes what the actor does but ``action_log_prob``, which :class:`Completion` adds.
+    It writes the actor's entries except ``action_log_prob``, which :class:`Completion` adds.
 
     Args:
         actor: see :func:`draws_otherwise`.
@@ -42,9 +42,9 @@ class GaussianSampler(TensorDictModuleBase):
         return tensordict.set("action", torch.normal(tensordict["loc"], tensordict["scale"]))
 
     def needs_tensordicts(self) -> str | None:
-        """Why :meth:`act` cannot stand for :meth:`forward`, by the part at fault.
+        """Why :meth:`act` cannot replace :meth:`forward`, naming the part.
 
-        None where it can: every part reads and writes plain entries.
+        None if it can: every part reads and writes plain entries.
         """
         for part in self._parts:
             if type(part) is not TensorDictModule:
@@ -71,10 +71,10 @@ def draws_otherwise(policy: TensorDictModuleBase) -> str | None:
 
 
 class Completion:
-    """Adds to a collected batch ``[N, T]`` what was left out at its steps.
+    """Adds to a collected batch ``[N, T]`` the entries that its steps left out.
 
-    That is ``next/reward`` and ``next/reward_terms`` of an environment that defers them, and ``action_log_prob`` where
-    a :class:`GaussianSampler` acted.
+    These are ``next/reward`` and ``next/reward_terms`` of an environment that defers them, and ``action_log_prob`` if a
+    :class:`GaussianSampler` acted.
 
     Args:
         env: the collector's.

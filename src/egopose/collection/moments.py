@@ -1,4 +1,4 @@
-"""Running moments of several workers made one, exactly (Chan, Golub & LeVeque 1979, the parallel variance)."""
+"""Running moments of several workers, merged exactly (Chan, Golub & LeVeque 1979, the parallel variance)."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def merge_states(
     Args:
         total: of everything counted before.
         states: of each worker now.
-        given: of each worker as it was last given; what it counted since is added to ``total``.
+        given: of each worker when it last received them; its counts since then are added to ``total``.
 
     Returns:
         A state dict as ``total``; entries that are no moments are left as they are.

@@ -1,8 +1,8 @@
 """Environments in processes of their own, on this machine or on many: one collector over TorchRL's two.
 
-Between two of its batches a worker is idle, and only then is it spoken to: a message that reaches a busy worker of
-TorchRL makes it throw its batch away. What is exchanged then: the worker gives the statistics of its normaliser and
-where its worlds stand, and gets the statistics of all workers back.
+The learner sends messages only between two batches, while a worker is idle: TorchRL's busy workers drop their batch
+when a message arrives. The worker then gives the statistics of its normaliser and the state of its environments. It
+gets the statistics of all workers back.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ def base_env(env: EnvBase) -> EnvBase:
 
 
 def read_simulation(collector: Collector) -> State:
-    """Where every world of a collector's own environment stands, and what the policy will see next."""
+    """The state of every environment of a collector, and the policy's next observation."""
     # TorchRL keeps the observation after the last step, and nothing else tells it, in `_carrier`. Beside it stand the
     # numbers of the episodes: workers draw them from one pool, whoever comes first, and nothing here reads them.
     # Sorted: in which order they stand depends on how often the worlds were stepped.
@@ -170,7 +170,7 @@ class Workers:
         self._given = [self.transforms] * self.count
 
     def load_simulation_state(self, states: Sequence[Mapping[str, Any]]) -> None:
-        """Put every worker where it stood at the end of its last batch. Before the first batch only.
+        """Put every worker into its state at the end of its last batch. Before the first batch only.
 
         Raises:
             ValueError: there are more or fewer workers than states.
@@ -199,7 +199,7 @@ class Workers:
         states = [report["transforms"] for report in reports]
         merged = merge_states(self.transforms, states, self._given)
         self._call_all("load_transform_state", [(_packed(merged),)] * self.count)
-        # Last: where a worker is missed before, what is saved stands where the iteration before ended.
+        # Last: if a worker is missed before this, the saved state is that of the end of the previous iteration.
         self.simulation = [report["simulation"] for report in reports]
         self.transforms = merged
         self._given = [merged] * self.count

@@ -87,7 +87,8 @@ def supported(
         states: of :func:`reference_states`.
         contacts: ``[T, K]`` of the sole points.
         fps: frames per second.
-        surface: ``[T]`` m, the lowest point of other bodies than feet (:func:`egopose.humanoid.foot_geometry.lowest_points`).
+        surface: ``[T]`` m, the lowest point of other bodies than feet, see
+            :func:`egopose.humanoid.foot_geometry.lowest_points`.
     """
     falls = falls_freely(states["com"].numpy(), fps)
     lowest = states["xpos"][:, :, 2].numpy().min(axis=1)

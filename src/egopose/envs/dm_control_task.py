@@ -26,8 +26,8 @@ from egopose.envs.starts import Starts
 class HumanoidPhysics(dm_mujoco.Physics):
     """One world that steps as :class:`~egopose.humanoid.physics.BatchedPhysics` does.
 
-    The constraint solver starts cold at every control step, and a step that diverges does not raise: the world goes
-    back to where it was, at rest, and :attr:`diverged` says so.
+    The constraint solver starts cold at every control step. A step that diverges does not raise: the world returns
+    to its previous pose, at rest, and :attr:`diverged` is true.
     """
 
     diverged = False

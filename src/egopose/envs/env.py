@@ -68,7 +68,7 @@ def _no_flags(endings: tuple[str, ...], size: torch.Size) -> dict[str, Tensor]:
 
 
 class _Lazily(Mapping[str, Tensor]):
-    """The body state of some worlds, whose places are worked out only where they are asked for."""
+    """The body state of some worlds; bodies' places are computed only on demand."""
 
     def __init__(self, physics: BatchedPhysics, rows: Indices) -> None:
         self._physics, self._rows = physics, rows
@@ -94,10 +94,10 @@ class EgoPoseEnv(EnvBase):
     Time: a reset puts a world on reference frame s. A step applies the action (the PD target for frame s + 1), runs the
     physics to s + 1 and rewards the state there against the reference there.
 
-    Keys: the problem's observations, float32 and raw (``humanoid_state [115]`` of imitation); int64 ``frame [1]``
-    (global reference frame), ``episode_start [1]`` (global), ``episode_stop [1]`` (global, exclusive), ``episode_step
-    [1]``; ``reward_terms`` (nested, ``[1]`` each); the problem's endings (``fallen [1]``) and ``diverged [1]``, bool;
-    ``action [52]``; ``reward``; ``terminated`` (an ending of the problem that ends the episode, diverged physics),
+    Observations: the problem's, float32 and raw (``humanoid_state [115]`` of imitation); int64 ``frame [1]``,
+    ``episode_start [1]`` and ``episode_stop [1]`` (global frames, stop exclusive), ``episode_step [1]``. Action:
+    ``action [52]``. Reward: ``reward``, and ``reward_terms`` (nested, ``[1]`` each). Flags, bool ``[1]``: the problem's
+    endings (``fallen``), ``diverged``, ``terminated`` (an ending that ends the episode, or diverged physics),
     ``truncated`` (horizon or end of the fragment), ``done``.
 
     A reset may bring its own first state: ``initial_qpos [N, 59]`` and ``initial_qvel [N, 58]`` in the reset's
@@ -111,7 +111,8 @@ class EgoPoseEnv(EnvBase):
         seed: of the starts.
         dump_dir: where diverged worlds leave their last states.
 
-    A collector need not know a reward to act on: after :meth:`make_rewards_lazy` it asks for those of a batch at once.
+    A collector does not need rewards in order to act: after :meth:`make_rewards_lazy` it asks for those of a batch at
+    once.
 
     The simulation's state is :meth:`state_dict`; note that TorchRL's ``TransformedEnv.state_dict`` holds the
     transforms only: take the base environment's beside it.
@@ -190,7 +191,7 @@ class EgoPoseEnv(EnvBase):
     def rewards_due(self) -> dict[str, Tensor]:
         """``reward`` and its terms by name, ``[N, T, 1]`` float32 each, of the T steps since the last call.
 
-        What each step would have given, worked out for many steps at once: a fourth of the cost.
+        The same values as step by step, but computed for many steps at once: a quarter of the cost.
 
         Raises:
             RuntimeError: rewards are not deferred, or no step was taken.
@@ -299,7 +300,7 @@ class EgoPoseEnv(EnvBase):
         return {key: value.float() for key, value in self.problem.observations(state, frame).items()}
 
     def ongoing(self, after: Mapping[Any, Any], worlds: slice = ALL) -> dict[str, Tensor]:
-        """Counters and flags of ``worlds``, entries ``after`` a step, where those that are done have begun anew."""
+        """Counters and flags of ``worlds`` in the entries ``after`` a step; those that are done begin a new episode."""
         flags = {name: flag[worlds] for name, flag in self._no_flags.items()}
         going_on = {name: after[name] & ~after["done"] for name in self.problem.endings}
         return {**self._clock(worlds), **flags, **going_on}
@@ -321,7 +322,7 @@ class EgoPoseEnv(EnvBase):
         return TensorDict(self._arrived(stopped, ALL), batch_size=self.batch_size)
 
     def try_step(self, action: Tensor) -> tuple[BodyView, dict[str, Tensor]]:
-        """A step that only looks what ``action [N, A]`` leads to: no reward, and no episode ends.
+        """A trial step under ``action [N, A]``: there is no reward, and no episode ends.
 
         Returns:
             The bodies, and the entries of their observations.
@@ -355,7 +356,7 @@ class EgoPoseEnv(EnvBase):
         return target.numpy()
 
     def _watched(self, body: dict[str, Tensor], worlds: slice) -> dict[str, Tensor]:
-        """What the problem watches of the present step beside the body, taken out of ``body``."""
+        """The watched parts of the present step beside the body, taken out of ``body``."""
         tops, turns = body.pop("box_tops", None), body.pop("box_quaternions", None)
         parts: dict[str, Tensor] = {
             name: body.pop(name) for name in ("floor_contacts", "box_contacts", "torques") if name in body
@@ -403,7 +404,7 @@ class EgoPoseEnv(EnvBase):
         }
 
     def state_dict(self, *args: Any, **kwargs: Any) -> dict[str, Tensor]:
-        """All that the simulation needs to go on to the bit: physics, episodes, random numbers, counters."""
+        """The state with which the simulation goes on to the bit: physics, episodes, random numbers, counters."""
         physics = {f"physics.{k}": torch.from_numpy(v) for k, v in self.physics.state_dict().items()}
         return physics | {
             "generator": self._generator.get_state(),

@@ -26,12 +26,12 @@ class ActionSettings:
 
     Args:
         reference: ``rest``: the rest pose (the paper); ``regressor``: a table of joint targets, one row a frame;
-            ``start``: the joint angles the body was placed with, as a reset or an estimated state put it there.
+            ``start``: the joint angles that the body was placed with by a reset or an estimated state.
         scale: of the action, rad per unit.
         velocity_feedforward: with ``regressor``, kd/kp times the table's joint velocity times this is added to the
             target, against the lag of a PD controller.
-        smoothing: s, standard deviation in time of a Gaussian over what the regressor saw (joint targets, states,
-            context) before it is followed; at most a third of a second either side counts.
+        smoothing: s, standard deviation in time of a Gaussian that smooths the regressor's joint targets, states and
+            context. It reaches at most a third of a second to either side.
         kind: ``pd``: actions move the targets of PD controllers; ``torque``: they are torques, a unit being the joint's
             limit times ``scale``, and the other settings are not read.
         joint_damping: with ``torque``, see :func:`egopose.humanoid.torques.torque_driven`.

@@ -14,9 +14,11 @@ from egopose.envs.mdp.rewards import RewardTable
 from egopose.envs.mdp.step_view import StepView
 from egopose.humanoid.model import HumanoidModel
 
-#: Of a body state, batch ``[N]``, float64: see docs/architecture.md.
+#: Keys of a body state, batch ``[N]``, float64: ``qpos [N, nq]``, ``qvel [N, nv]`` and ``com [N, 3]`` m of the body,
+#: ``xpos [N, B, 3]`` m and ``xquat [N, B, 4]`` of its parts in the world. A reference has the same keys, and
+#: ``com_vel [N, 3]`` m/s.
 BODY_KEYS = ("qpos", "qvel", "xpos", "xquat", "com")
-#: Of what an environment writes: which row of what is followed each body should be in, ``[N]`` int64.
+#: From what an environment writes to the row of the target motion that each body should be in, ``[N]`` int64.
 Rows = Callable[[Mapping[str, Tensor]], Tensor]
 
 
@@ -35,7 +37,7 @@ class Scene(NamedTuple):
 
 
 class Followed(NamedTuple):
-    """What bodies follow at test time, where the truth is not known.
+    """The target motion of bodies at test time, when the truth is not known.
 
     Attributes:
         states: ``[R, 2 nq - 3]`` humanoid states.
@@ -99,7 +101,7 @@ class Problem(Protocol):
     watched: frozenset[str]
 
     def view(self, state: BodyState | BodyView) -> BodyView:
-        """``state`` and what follows from it; every other method takes either."""
+        """``state`` with the quantities derived from it; every other method takes either."""
         ...
 
     def observations(self, state: BodyState | BodyView, frame: Tensor) -> dict[str, Tensor]:
@@ -134,5 +136,5 @@ class Problem(Protocol):
         ...
 
     def followed(self, starts: Tensor | None = None) -> Followed:
-        """What bodies follow whose episodes begin at global frames ``[W]``."""
+        """The target motion of bodies whose episodes begin at global frames ``[W]``."""
         ...

@@ -89,10 +89,10 @@ class ReferenceForecasts:
 class TrackForecast(Transform):
     """What a policy needs to follow a curve. To stand before :class:`egopose.envs.transforms.StateNormalizer`.
 
-    Writes ``followed_targets [nu]``, rad from the rest pose: the joint angles the curve has at the next step, and its
-    velocity there times a part of a PD controller's lag; ``tracking_error [2 S]``, as
-    :class:`egopose.envs.transforms.TrackingError`: the state's scaled error against the curve, and the curve's scaled
-    step to the next frame; ``visual_context``, the scaled poses of the steps ``ahead``.
+    It writes three entries. ``followed_targets [nu]``, rad from the rest pose, are the curve's joint angles at the next
+    step, plus its velocity there times a part of a PD controller's lag. ``tracking_error [2 S]``, as
+    :class:`egopose.envs.transforms.TrackingError`, is the state's scaled error against the curve, and the curve's
+    scaled step to the next frame. ``visual_context`` holds the scaled poses of the steps ``ahead``.
 
     Args:
         forecasts: the curves.

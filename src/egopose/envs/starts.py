@@ -23,7 +23,7 @@ class Piece(NamedTuple):
 
 
 def after_context(fragments: Sequence[FragmentLike], context: int, minimum: int = 2) -> list[Piece]:
-    """Where forecasts of each fragment can begin and what follows: from the last of its first ``context`` frames on.
+    """The part of each fragment that can be forecast: from the last of its first ``context`` frames on.
 
     Pieces of fewer than ``minimum`` frames are left out.
     """
@@ -120,7 +120,7 @@ def _bounds(fragments: Sequence[FragmentLike], offsets: Tensor, lengths: Tensor)
 
 
 class UniformStarts(Unlearning):
-    """Every frame that leaves room enough is as likely a start as any other.
+    """All frames that leave enough room are equally likely starts.
 
     Args:
         fragments: where episodes may lie.
@@ -152,11 +152,11 @@ class UniformStarts(Unlearning):
 
 
 class AdaptiveStarts(UniformStarts):
-    """Starts drawn the more often the sooner episodes begun near them fell, from bins of neighbouring frames.
+    """Starts near early falls are drawn more often, by bins of neighbouring frames.
 
-    A bin of ``s`` frames whose episodes survived n frames, as a running estimate, is drawn in proportion to
-    ``s / (n / unit + 1)`` (Yu, Park & Lee 2021, eq. 13, which counts samples in the place of frames survived), but for
-    a share ``floor`` of uniform starts, so that no start vanishes. Before the first episodes all is uniform.
+    A bin of ``s`` frames is drawn in proportion to ``s / (n / unit + 1)``, n being a running estimate of the frames its
+    episodes survived (Yu, Park & Lee 2021, eq. 13, which counts samples instead). A share ``floor`` of the starts stays
+    uniform, so that no start vanishes. Before the first episodes all starts are uniform.
 
     Args:
         fragments, offsets, lengths, horizon, minimum: see :class:`UniformStarts`.

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from egopose.checkpoint.checkpoint import find_checkpoint, read_json
-from egopose.checkpoint.pretrained import PREFIX, shipped_names
+from egopose.checkpoint.pretrained import PREFIX, pretrained_names
 from egopose.core.config import compose_config
 from egopose.core.errors import InputError
 from egopose.data.preparation import flow_name, store_folder
@@ -96,7 +96,7 @@ def show_shipped(config: Mapping[str, Any], out: Path) -> dict[str, str]:
         The folder of each, by name; those that do not fit the data are left out, with a line.
     """
     written = {}
-    for name in shipped_names():
+    for name in pretrained_names():
         own = read_json(find_checkpoint(f"{PREFIX}{name}"), "config")
         seen = {**own, "data": config["data"]}
         if (store_folder(seen), flow_name(seen)) != (store_folder(config), flow_name(config)):

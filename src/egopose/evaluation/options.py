@@ -12,7 +12,7 @@ from egopose.core.errors import InputError
 
 
 def output_folder(out: str | None, checkpoint: Path, split: str) -> Path:
-    """Where results go: ``out``, or ``RUN/evaluation/SPLIT``, or ``evaluation/NAME/SPLIT`` here for ``weights:NAME``.
+    """Where results go: ``out``, or ``RUN/evaluation/SPLIT``; ``evaluation/NAME/SPLIT`` here for ``pretrained:NAME``.
 
     Raises:
         InputError: ``out`` lies inside the checkpoint, whose files are sealed by checksums.
@@ -39,9 +39,9 @@ def data_at(folder: str | None, checkpoint: str, which: str) -> dict[str, Any]:
     """The run's own config group ``data`` with its folder there, to be an override; empty for None.
 
     Raises:
-        InputError: None for shipped weights, which know no folder of this machine; the checkpoint cannot be read.
+        InputError: None for pretrained weights, which name no folder of this machine; the checkpoint cannot be read.
     """
-    if folder is None and not weights.is_shipped(checkpoint):
+    if folder is None and not weights.is_pretrained(checkpoint):
         return {}
     data = read_json(find_checkpoint(checkpoint, which), "config")["data"]
     if folder is None:

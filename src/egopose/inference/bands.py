@@ -1,8 +1,8 @@
 """Error bands of drawn futures, made to hold what they promise on windows kept for that.
 
-A band is the middle ``level`` of the K futures of each joint at each frame, widened about their median by a scale a
-frame, so that the truth of the calibration windows lies inside as often as the level says (split conformal prediction,
-Lei et al. 2018, with the spread of the futures for the scale of the error).
+A band holds the middle ``level`` of the K futures of each joint at each frame. It is widened about their median by
+one scale a frame. The truth of the calibration windows then lies inside as often as the level says (split conformal
+prediction, Lei et al. 2018, with the spread of the futures for the scale of the error).
 """
 
 from __future__ import annotations

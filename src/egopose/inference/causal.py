@@ -1,11 +1,11 @@
 """What the state regressor says of each frame when only a few frames after it have been seen.
 
-Frame t's answer has seen the frames up to ``t + lookahead`` and no more (Yuan & Kitani 2019, section 5: 10 frames, a
-fixed latency of 1/3 s): the forward direction is carried on, the backward direction is run anew over the look-ahead.
-The work of a frame does not depend on how many there were.
+The result of frame t depends on the frames up to ``t + lookahead`` and no more (Yuan & Kitani 2019, section 5: 10
+frames, a fixed latency of 1/3 s). The forward direction is carried on; the backward direction is run again over the
+look-ahead. The work of a frame does not depend on how many there were.
 
-Runs that follow the regressor smoothed in time (``task.action.smoothing``) get the same Gaussian here, inside the same
-look-ahead: the frames after t count as they appear at ``t + lookahead``, those before as they were given out.
+Runs with a regressor smoothed in time (``task.action.smoothing``) get the same Gaussian here, inside the same
+look-ahead. Frames after t count as they appear at ``t + lookahead``, those before as they were given out.
 """
 
 from __future__ import annotations

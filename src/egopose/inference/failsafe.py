@@ -1,7 +1,7 @@
 """When to give up on the humanoid's state and restart it from the regressor's (Yuan & Kitani 2019, section 3.3).
 
-Three modes. ``value``: reset when ``V(s_t) < reset_threshold * V_mean``, V_mean the running mean of V over the take so
-far. ``naive``: reset when the humanoid has fallen, its head under a height. ``off``: never.
+Three modes. ``value``: reset when ``V(s_t) < reset_threshold * V_mean`` (the paper's kappa), V_mean the running mean
+of V over the take so far. ``naive``: reset when the humanoid has fallen, its head under a height. ``off``: never.
 """
 
 from __future__ import annotations
@@ -55,11 +55,11 @@ class FailSafeSettings:
 
 
 def paper_threshold(discount: float) -> float:
-    """The paper's reset_threshold of .6, which belongs to its discount of .95, for values of another discount.
+    """The paper's threshold (its kappa) of .6 belongs to its discount of .95; this is the one for another discount.
 
-    At an even reward r, a state whose episode ends in n frames is worth ``r (1 - discount^n) / (1 - discount)``, one
-    that goes on for ever ``r / (1 - discount)``: reset_threshold times the latter is reached n frames before the end,
-    where ``reset_threshold = 1 - discount^n``. What is kept is n, 17.9 frames; at .99 reset_threshold becomes .164.
+    At an even reward r, a state whose episode ends in n frames has value ``r (1 - discount^n) / (1 - discount)``. One
+    that goes on for ever has ``r / (1 - discount)``. The first is kappa times the second n frames before the end, with
+    ``kappa = 1 - discount^n``. The same n is kept, 17.9 frames; at a discount of .99 the threshold becomes .164.
 
     Raises:
         InputError: a discount that is not between 0 and 1.
@@ -97,9 +97,9 @@ class FailSafe:
     def update(self, value: Tensor, head_height: Tensor, active: Tensor) -> Tensor:
         """Record a frame and say which worlds must be reset.
 
-        Every frame of the take counts in the mean, this one and those that triggered included, so that a stretch the
-        value network rates low throughout ends in a lower bar and not in a reset at every frame. A mean that is not
-        positive says nothing of a drop, and nothing triggers then.
+        Every frame of the take counts in the mean, also this one and those that triggered. So a stretch with low values
+        throughout lowers the threshold, and does not reset the body at every frame. A mean that is not positive says
+        nothing of a drop, and nothing triggers then.
 
         Args:
             value: ``[N]`` V(s_t).

@@ -1,7 +1,6 @@
 """From a configuration to the kinematic forecasts a policy follows: trained once a run, kept in ``RUN_DIR/forecaster``.
 
-Forecasts that begin at training frames are those of networks that have not seen the frames around them, nor any they
-forecast: a policy must not trust them more than it may on new takes.
+Forecasts on training frames are cross-fitted, so the policy does not learn to over-trust them.
 """
 
 from __future__ import annotations
@@ -22,8 +21,8 @@ def begin_forecasts(agent: Agent, windows: Sequence[ForecastWindow], pasts: Tens
     """Where forecasts of ``windows`` begin: ``qpos [W, nq]`` and ``qvel [W, nv]``, placed where the reference is, feet
     out of the floor.
 
-    That is the last state of ``pasts [W, context, S]``; where the agent follows kinematic forecasts, it is where those
-    begin, and from now on the agent follows, from these frames, the ones that have seen ``pasts`` alone.
+    That is the last state of ``pasts [W, context, S]``. If the agent follows kinematic forecasts, it is where those
+    begin. From then on the agent follows, from these frames, forecasts made from ``pasts`` alone.
     """
     dataset = agent.dataset
     now = torch.tensor([int(dataset.takes.offsets[w.take]) + w.now for w in windows])

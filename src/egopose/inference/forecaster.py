@@ -1,7 +1,7 @@
 """From a policy and the state at the end of a context to futures: the mean one, or several drawn.
 
-Yuan & Kitani 2019, section 3.2: the context of the video seen is fixed, and the policy goes on from its own states, so
-that a future may be of any length.
+Yuan & Kitani 2019, section 3.2: the context of the seen video is fixed, and the policy goes on from its own states.
+So a future may have any length.
 """
 
 from __future__ import annotations
@@ -51,8 +51,8 @@ def forecast(
 ) -> Forecasts:
     """Roll the policy out from the given states.
 
-    With one sample the policy's mean action is taken, with more each future draws its own actions: at each step from
-    the policy's distribution, over time as a first-order process, since a person does not tremble.
+    With one sample the policy's mean action is taken. With more, each future draws its own actions from the policy's
+    distribution. Their noise is a first-order process in time, since a person does not tremble.
 
     Args:
         env: over :class:`EgoPoseEnv` with ``WholeFragments`` starts and falls that do not end the episode; window w is

@@ -1,12 +1,11 @@
-"""Looking ahead in the simulator: of many ways to go on, each simulated for some frames, the body takes the best.
+"""Looking ahead in the simulator: many candidates are simulated for some frames, and the body takes the best.
 
-The body that acts a video out is simulated anyway, so what an action leads to can be tried before it is taken
-(predictive sampling: Howell et al. 2022, arXiv 2212.00541; the policy's value at the horizon's end: Lowrey et al. 2019,
-POLO). A way to go on is the policy's mean action plus an addition that changes smoothly; the policy reacts in each.
-Chance alone rarely finds a way that is good in all joints, so later rounds try what lies between and about the best
-of those before (the cross-entropy method: Rubinstein 1999; in control: Chua et al. 2018, PETS).
-What they are judged by is what the body follows, the state regressor's motion or a kinematic forecast; the true motion
-plays no part.
+The body is simulated anyway, so an action can be tried before it is taken (predictive sampling: Howell et al. 2022,
+arXiv 2212.00541; the policy's value at the horizon's end: Lowrey et al. 2019, POLO). A candidate is the policy's mean
+action plus a smooth perturbation; the policy reacts in each. Chance alone rarely finds a candidate that is good in all
+joints. So later rounds try candidates between and around the best ones (the cross-entropy method: Rubinstein 1999; in
+control: Chua et al. 2018, PETS). Candidates are compared with the target motion: the state regressor's, or a kinematic
+forecast. The true motion plays no part.
 """
 
 from __future__ import annotations
@@ -34,26 +33,26 @@ from egopose.models.pose_regression import state_to_qpos
 _EPISODE = ("take", "start", "stop", "frame")  # with one number for each body
 _ROWS = ("placed", *(f"physics.{name}" for name in PER_WORLD))  # with more
 
-_PARTS = (0.25, 0.5, 0.75)  # of the best way, tried in later rounds
-_ELITES = (2, 4, 8)  # ways whose means are tried
-_NARROWED = 0.5  # of the additions' deviation, about the mean of the second of these
-_BROKEN = 1000.0  # what a way loses whose physics break: more than any sum of rewards
+_PARTS = (0.25, 0.5, 0.75)  # of the best candidate, tried in later rounds
+_ELITES = (2, 4, 8)  # candidates whose means are tried
+_NARROWED = 0.5  # of the perturbations' deviation, around the mean of the second of these
+_BROKEN = 1000.0  # lost by a candidate whose physics break: more than any sum of rewards
 
 
 class Planner:
-    """Plans for N bodies side by side; a copy of each tries ``samples`` ways.
+    """Plans for N bodies side by side, each with ``samples`` copies that try candidates.
 
     Args:
-        env: of ``N * samples`` worlds like those that are planned for, falls not ending an episode, its normaliser
-            frozen.
+        env: ``N * samples`` environments like those that are planned for. A fall does not end an episode, and the
+            normaliser is frozen.
         actor, critic: policy and value network, in evaluation mode; sequences of modules that read and write plain
             entries.
         settings: see :class:`PlannerSettings`.
-        followed: what the bodies follow; None for what the problem says of all frames.
+        followed: the target motion; None for the problem's own, of all frames.
 
     Attributes:
-        value: ``[N]`` what the best way was worth: discounted rewards and, at the horizon, V; nothing for a body that
-            lies where what is followed stands.
+        value: ``[N]`` return of the best candidate: discounted rewards and, at the horizon, V. It is 0 while the head
+            is more than ``lost`` below its target, so that a fallen body is reset.
 
     Raises:
         InputError: actions are torques, the policy has a memory, or no hinge is named.
@@ -75,9 +74,9 @@ class Planner:
                 "planner", "action", "a planner moves targets of PD controllers, not torques: planner=none"
             )
         if any(isinstance(part, RecurrentStates) for part in env.transform):
-            raise InputError("planner", "model.memory", "a planner's ways begin without a memory: planner=none")
+            raise InputError("planner", "model.memory", "a planner's candidates begin without a memory: planner=none")
         self.settings, self._env, self._base = settings, env, base
-        # The mean is what a deterministic policy does: no need of the distribution behind it.
+        # Only the mean action is needed, so the distribution is left out.
         gaussian = isinstance(actor, ProbabilisticTensorDictSequential)
         self._actor = [part for step in (actor.module[:-1] if gaussian else [actor]) for part in parts_of(step)]
         self._action, self._critic = "loc" if gaussian else "action", parts_of(critic)
@@ -97,9 +96,9 @@ class Planner:
         self._returns, self.value = torch.zeros(worlds), torch.zeros(worlds)
 
     def _what_is_followed(self, states: Tensor) -> tuple[dict[str, Tensor], Tensor]:
-        """What the reward reads of the regressor's bodies, and their heads' height ``[F]`` m.
+        """What the reward reads of the target motion, and the height of its heads ``[F]`` m.
 
-        They stand at the origin and face along x: nothing in the heading frame depends on it.
+        The bodies stand at the origin and face along x: the heading frame does not depend on it.
         """
         problem, worlds = self._base.problem, self._base.batch_size[0]
         views: list[dict[str, Tensor]] = []
@@ -114,8 +113,10 @@ class Planner:
         return {name: torch.cat([view[name] for view in views]) for name in self._reward.reads}, torch.cat(heights)
 
     def perturbation(self, base: EgoPoseEnv) -> Tensor:
-        """``[N, nu]`` to add to the policy's mean action now, in the state of ``base`` (N worlds); planned anew where
-        it is time to."""
+        """``[N, nu]`` to add to the policy's mean action in the present state of ``base`` (N environments).
+
+        Every ``every`` frames it plans anew.
+        """
         if self._age % self.settings.every == 0:
             self._look_ahead(base)
         self._age += 1
@@ -128,11 +129,11 @@ class Planner:
         return now
 
     def forget(self, worlds: Tensor) -> None:
-        """``worlds [n]`` were placed elsewhere: what was planned for them, and their value, hold no more."""
+        """``worlds [n]`` were placed elsewhere: their plans are dropped, and all bodies plan anew."""
         self._plan[worlds], self._age = 0.0, 0
 
     def _perturbations(self, count: int, wider: float = 1.0) -> Tensor:
-        """``[count, N, H, nu]`` additions drawn anew, straight lines between their knots."""
+        """``[count, N, H, nu]`` new random perturbations, linear between their knots."""
         settings, (worlds, _, size) = self.settings, self._plan.shape
         knots = -(-(settings.horizon - 1) // settings.knot_spacing) + 1
         at_knots = torch.randn(count, worlds, knots, size, generator=self._generator) * (wider * self._deviation)
@@ -143,16 +144,17 @@ class Planner:
         return torch.lerp(at_knots[:, :, left], at_knots[:, :, (left + 1).clamp(max=knots - 1)], share)
 
     def _candidates(self) -> Tensor:
-        """``[K, N, H, nu]``: none, the plan so far, changes of it, and ways of their own."""
+        """``[K, N, H, nu]``: no perturbation, the current plan, changes of it, and new ones."""
         candidates, plan = self._perturbations(self.settings.samples), self._plan[:, : self.settings.horizon]
         candidates[: self.settings.samples // 2] += plan
         candidates[0], candidates[1] = 0.0, plan
         return candidates
 
     def _refined(self, candidates: Tensor, score: Tensor, wider: float = 1.0) -> Tensor:
-        """``[K, N, H, nu]`` between and about the best of ``candidates``, by their ``score [>= K, N]``.
+        """``[K, N, H, nu]`` between and around the best of ``candidates``, by their ``score [>= K, N]``.
 
-        Parts of the best, or of its change of the plan so far, means of the best ones, and the rest about such a mean.
+        They are parts of the best one, parts of the way from the current plan to it, and means of the best ones. The
+        rest are drawn around such a mean.
         """
         best = candidates[
             score.topk(min(max(_ELITES), len(candidates)), dim=0).indices, torch.arange(candidates.shape[1])
@@ -176,7 +178,7 @@ class Planner:
                 more = self._refined(candidates, score)
             elif not (low[score.argmax(0), worlds] > settings.height_drop).any():
                 break
-            else:  # what balances a body does not catch one that falls
+            else:  # small perturbations balance a body; catching a fall needs larger ones
                 wide = settings.wider
                 more = (
                     self._refined(candidates, score, wide)
@@ -188,18 +190,18 @@ class Planner:
             candidates, score, returns, low = (torch.cat(pair) for pair in pairs)
         most, change = score.amax(0), (candidates - candidates[1]).square().mean((2, 3))
         best = torch.where(score >= most - settings.tie_tolerance, change, torch.inf).argmin(0)
-        # Chance finds small gains in any noise; to follow each of them is to tremble.
+        # Random search finds small gains in any noise. Following each of them makes the body tremble.
         enough = most - settings.margin
         best = torch.where(score[0] >= enough, 0, torch.where(score[1] >= enough, 1, best))
         self._returns = returns[best, worlds]
         self._plan[:, : settings.horizon] = candidates[best, worlds]
 
     def _tried(self, now: Mapping[str, Tensor], candidates: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """What ``candidates [K, N, H, nu]`` come to ``[K, N]`` from the bodies' state ``now``.
+        """Simulate ``candidates [K, N, H, nu]`` from the bodies' state ``now``.
 
         Returns:
-            Rewards less the price of how they are come by; rewards alone; and by how many metres the head ends lower
-            than what is followed has it.
+            Of each candidate ``[K, N]``: rewards less costs, rewards alone, and by how many metres the head ends below
+            its target.
         """
         settings, copies, problem = self.settings, self._base, self._base.problem
         self._copy(now)
@@ -230,7 +232,7 @@ class Planner:
         return score, returns, low
 
     def _copy(self, state: Mapping[str, Tensor]) -> None:
-        """Put every body's copies where the body is, in ``state`` of its environment."""
+        """Put the copies of every body into the body's state, taken from ``state`` of its environment."""
         samples = self.settings.samples
         own = self._base.state_dict()
         own |= {name: state[name].repeat(samples) for name in _EPISODE}

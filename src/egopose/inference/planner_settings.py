@@ -16,26 +16,27 @@ class PlannerSettings:
     """``conf/planner``; each file gives every value and its source.
 
     Args:
-        samples: ways tried at a time.
-        rounds: of so many ways each, the later ones between and about the best of those before.
-        recovery_rounds: further rounds at most, as long as some body's best way ends with its head lower by ``sinking``
-            (m) than what is followed has it; by turns drawn anew and about the best, the deviation ``wider`` times as
-            large.
-        horizon: frames they are simulated for.
+        samples: candidates tried at a time.
+        rounds: rounds of so many candidates. Later rounds try candidates between and around the best ones so far.
+        recovery_rounds: most further rounds while the head of some body ends more than ``height_drop`` below its target
+            in the best candidate. Every second one is drawn anew, the others lie around the best.
+        height_drop: m, see ``recovery_rounds``.
+        wider: factor of the deviation in recovery rounds.
+        horizon: frames that a candidate is simulated for.
         every: frames between plans.
-        knot_spacing: frames between the knots of an addition, which is linear in between.
-        deviation: rad, of the largest additions at their knots; others are down to a tenth of it.
-        joints: only hinges whose name contains one of these are added to.
+        knot_spacing: frames between the knots of a perturbation, which is linear in between.
+        deviation: rad, of the largest perturbations at their knots; others have down to a tenth of it.
+        joints: only hinges whose name contains one of these are perturbed.
         acceleration: reward lost per unit (m/s^2, rad/s^2) of the velocities' mean absolute change.
-        head: reward lost per metre by which the head is lower than what is followed has it.
-        lost: m; a body whose head is lower than that by more is worth nothing to the fail-safe, whatever its plan.
-        margin: reward by which a way must do better than the plan so far to be taken, and either than no addition.
-        tie_tolerance: reward; of ways that are worse than the best by no more, the one that changes least of the plan
-            so far is taken.
+        head: reward lost per metre that the head is below its target.
+        lost: m; the value is 0 while the head is further than this below its target, so a fallen body is reset.
+        margin: reward by which a candidate must beat the current plan, and either must beat no perturbation.
+        tie_tolerance: reward; candidates no further than this below the best are near-ties. Near-ties go to the
+            candidate closest to the current plan.
         discount: of a frame.
-        reset_threshold: of the fail-safe, where it has none of its own, for the values of plans.
-        reward: as a file of ``conf/reward`` in the heading frame: how near the body is to what it follows.
-        seed: of the additions.
+        reset_threshold: of the fail-safe for a planner's values, if the fail-safe has none of its own.
+        reward: as a file of ``conf/reward`` in the heading frame: compares the body with the target motion.
+        seed: of the perturbations.
     """
 
     samples: int
@@ -63,7 +64,7 @@ class PlannerSettings:
             if not ok:
                 raise InputError("planner", name, cause)
 
-        check(self.samples >= 3, "samples", "must be at least 3: without an addition, the plan so far, and a new one")
+        check(self.samples >= 3, "samples", "must be at least 3: no perturbation, the current plan, and a new one")
         check(self.rounds >= 1, "rounds", "must be at least 1")
         check(0 < self.every <= self.horizon, "every", "must lie between 1 and the horizon")
         for name in ("knot_spacing", "deviation", "lost", "height_drop", "wider"):

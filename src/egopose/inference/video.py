@@ -35,7 +35,7 @@ from egopose.vision.lens import Camera
 
 
 def run_estimate(config: Mapping[str, Any], agent: Agent, pose_motion: Motion, video: Path, out: Path) -> Path:
-    """Drive the humanoid through the video and write what came of it.
+    """Estimate the motion of a video and write the results.
 
     Args:
         config: resolved ``conf/estimate.yaml``.
@@ -81,9 +81,9 @@ def run_estimate(config: Mapping[str, Any], agent: Agent, pose_motion: Motion, v
 
 
 def allowed_planner(config: Mapping[str, Any]) -> PlannerSettings | None:
-    """How the body looks ahead by ``conf/estimate.yaml``, None for not at all.
+    """The planner's settings by ``conf/estimate.yaml``; None for no planner.
 
-    What is seen live is known for ``lookahead`` frames, and a planner's horizon is longer: ``causal`` goes without.
+    ``causal`` has no planner: its look-ahead is ``lookahead`` frames, and a planner's horizon is longer.
 
     Raises:
         InputError: a setting is missing or wrong.
@@ -107,7 +107,7 @@ def allowed_lookahead(config: Mapping[str, Any]) -> int | None:
 
 
 def estimate_video(values: Mapping[str, Any]) -> Path:
-    """The whole way of ``conf/estimate.yaml``, resolved: video, flow, regressor, policy, files.
+    """From video to files, as ``conf/estimate.yaml`` (resolved) says: flow, regressor, policy.
 
     Returns:
         The folder of the results.

@@ -56,12 +56,12 @@ def _crossed(source_config: Mapping[str, Any]) -> bool:
 def seen_in(
     humanoid: HumanoidModel, regressor: StateRegressor, flow: np.ndarray, source_config: Mapping[str, Any]
 ) -> dict[str, Tensor]:
-    """What the regressor makes of a whole video.
+    """The regressor's output for a whole video.
 
     Args:
         humanoid: the run's.
         regressor: trained, in eval mode.
-        flow: ``[T, 2, S, S]`` of the video at the control rate, with a third plane where the regressor sees limbs.
+        flow: ``[T, 2, S, S]`` of the video at the control rate, with a third plane if the regressor reads body parts.
         source_config: the groups ``vision`` and ``regressor`` it was trained with.
 
     Returns:
@@ -98,10 +98,10 @@ def require_estimation(run: Mapping[str, Any], checkpoint: str | Path) -> None:
 
 
 def video_dataset(humanoid: HumanoidModel, seen: Mapping[str, Tensor], name: str) -> tuple[Dataset, Motion]:
-    """What the policy needs of a video: a take whose reference is what the state regressor makes of it by itself.
+    """The dataset of a video: one take, whose reference is the state regressor's own estimate.
 
-    There is no mocap. PoseReg's motion, from the origin and heading along x, stands in its place: it gives the policy
-    its start, and no figure is taken from the distance to it.
+    There is no mocap. PoseReg's motion takes its place, from the origin and facing along x. It gives the policy its
+    start; no figure is computed from the distance to it.
 
     Args:
         humanoid: the run's.

@@ -1,7 +1,7 @@
 """The state regressor F beside a kernel regression: ``share * F + share * kernel + rest * mean``.
 
 A blended F is a :class:`StateRegressor` of other parts, so that whatever takes an F takes it: its encoder gives the
-network's features, the flow's mean in a few cells and what a limb finder makes of the picture, its context the
+network's features, the flow's mean in a few cells and the output of the body-part estimator, its context the
 network's context and what those others saw in the half second around, its head mixes what the two make of it. Beyond
 Yuan & Kitani 2019, whose PoseReg it is not.
 """

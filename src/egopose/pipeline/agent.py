@@ -45,7 +45,7 @@ class Agent:
         actor, critic: in evaluation mode.
         config: resolved, of its run.
         dataset: see :class:`Dataset`.
-        make_env: ``make_env(split="test", worlds=1, ...)`` as :func:`build_env`, with the normaliser as trained and
+        make_env: ``make_env(split="test", num_envs=1, ...)`` as :func:`build_env`, with the normaliser as trained and
             frozen.
         path: the checkpoint.
     """
@@ -189,7 +189,7 @@ def _normalizer(state: Mapping[str, Any], folder: Path) -> StateNormalizer:
 def _observation_widths(
     settings: PolicySettings, actor: Mapping[str, Any], state_size: int, action_size: int, folder: Path
 ) -> dict[str, int]:
-    """What each observation's last axis is; that of the visual context is what the actor's first layer has left."""
+    """The size of each observation's last axis; that of the visual context is the rest of the actor's first layer."""
     widths = {
         "humanoid_state": state_size,
         "tracking_error": 2 * state_size,
@@ -207,7 +207,7 @@ def _observation_widths(
 
 
 def _other_store(own: Mapping[str, Any], config: Mapping[str, Any]) -> bool:
-    """Whether ``config`` asks for other data than a run's own, and not for the same that lies elsewhere by now."""
+    """Whether ``config`` asks for other data than a run's own. The same data in another folder is not other data."""
 
     def parts(one: Mapping[str, Any]) -> list[Any]:
         place = dict.fromkeys(("folder", "store"))

@@ -1,7 +1,6 @@
 """From a configuration to the kinematic forecasts a policy follows: trained once a run, kept in ``RUN_DIR/forecaster``.
 
-Forecasts that begin at training frames are those of networks that have not seen the frames around them, nor any they
-forecast: a policy must not trust them more than it may on new takes.
+Forecasts on training frames are cross-fitted, so the policy does not learn to over-trust them.
 """
 
 from __future__ import annotations
@@ -44,8 +43,8 @@ from egopose.training.motion_forecast import ForecastLearner, build_forecaster, 
 
 @dataclass(frozen=True)
 class Members:
-    """A forecaster's parts: ``(1 - share) * mean of the networks' curves + share * the kernel's``, and of each
-    coefficient of that a share ``[K, 1]`` of the one that goes on frame by frame."""
+    """The parts of a forecaster: ``(1 - share) * mean of the networks' curves + share * the kernel's``. Each
+    coefficient is then mixed, by a share ``[K, 1]``, with that of the network that goes on frame by frame."""
 
     networks: list[MotionForecaster]
     kernel: KernelForecaster | None = None
@@ -55,9 +54,9 @@ class Members:
 
 
 def with_forecasts(config: Mapping[str, Any], dataset: Dataset, run: Path) -> Dataset:
-    """The dataset with the run's forecasts, trained where that has not been done.
+    """The dataset with the run's forecasts. The forecaster is trained if the run does not have one yet.
 
-    Itself where the run has no forecaster, or the dataset has forecasts already.
+    The dataset itself if the run has no forecaster, or if it has forecasts already.
 
     Args:
         config: resolved; its group ``forecaster`` says how, or is null.

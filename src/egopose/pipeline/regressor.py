@@ -375,7 +375,7 @@ def load_regressor(weights: str | Path) -> tuple[StateRegressor, dict[str, Any]]
         weights: ``STORE/regressors/NAME``, or ``RUN_DIR/regressor``.
 
     Raises:
-        InputError: the folder is damaged or of another kind, or was made with another limb finder.
+        InputError: the folder is damaged or of another kind, or was made with another body-part estimator.
     """
     folder = Path(weights)
     config = read_json(folder, "config")
@@ -397,7 +397,9 @@ def load_regressor(weights: str | Path) -> tuple[StateRegressor, dict[str, Any]]
     RunCheckpoint({"regressor": model}).restore(folder)
     finder = body_part_estimator_name(config["regressor"])
     if finder is not None and config.get("finder") not in (None, body_part_fingerprint(finder)):
-        raise InputError(folder, "finder", f"it was made with another limb finder {finder!r} than this egopose has")
+        raise InputError(
+            folder, "finder", f"it was made with another body-part estimator {finder!r} than this egopose has"
+        )
     return model.eval(), config
 
 

@@ -48,7 +48,7 @@ class FlowAndBodyParts:
 
 
 def body_part_estimator_name(regressor: Mapping[str, Any]) -> str | None:
-    """The limb finder's name in a group ``regressor``, None where only flow is seen."""
+    """The name of the body-part estimator in a group ``regressor``; None if only flow is read."""
     kernel = regressor.get("kernel")
     return None if kernel is None else kernel.get(_KEY)
 
@@ -59,7 +59,7 @@ def planes_of(regressor: Mapping[str, Any]) -> int:
 
 
 def load_body_part_estimator_of(regressor: Mapping[str, Any]) -> BodyPartEstimator | None:
-    """The limb finder of a group ``regressor``. Raises InputError: there is none of that name."""
+    """The body-part estimator of a group ``regressor``. Raises InputError: there is none of that name."""
     name = body_part_estimator_name(regressor)
     return None if name is None else load_body_part_estimator(name)
 
@@ -105,7 +105,7 @@ def _find_body_parts(config: Mapping[str, Any], store: TakeStore, flow: Tensor, 
 
     print(f"finding limbs in {store.frames_total} pictures", file=sys.stderr, flush=True)
     if not all(take.rendered for take in store.takes):
-        reported = "the limb finder has never seen a filmed body: compare with regressor.kernel.body_parts=null"
+        reported = "the body-part estimator has never seen a filmed body: compare with regressor.kernel.body_parts=null"
         print(f"note: {reported}", file=sys.stderr, flush=True)
     settings = FlowConfig(**dict(config["vision"]["flow"]))
     rows = []

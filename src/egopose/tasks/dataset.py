@@ -1,4 +1,4 @@
-"""What a policy is trained on and judged by: everything that comes from data, none of it learned by PPO."""
+"""The data a policy is trained and judged on; nothing in it is learned by PPO."""
 
 from __future__ import annotations
 
@@ -83,7 +83,7 @@ class Dataset:
 
 
 def require_same_store(run: Path, fingerprint: str) -> None:
-    """A run may go on, or be judged, only on the data it was trained on. Runs that noted no store are let through.
+    """A run may be resumed or judged only on the data it was trained on. Runs that noted no store are accepted.
 
     Raises:
         InputError: the run directory notes another fingerprint, or its note is damaged.
@@ -114,9 +114,9 @@ def take_table(takes: Sequence[TakeInfo]) -> TakeTable:
 
 
 def smoothed(dataset: Dataset, deviation: float) -> Dataset:
-    """The dataset with what the regressor saw smoothed in time, take by take.
+    """The dataset with the regressor's tables smoothed in time, take by take.
 
-    The regressor judges each frame nearly by itself: its joints jitter at 14 rad/s^2 where people's move at 3. States
+    The regressor treats each frame nearly by itself: its joints jitter at 14 rad/s^2, while people's move at 3. States
     are smoothed number by number (a quaternion so near its neighbours may be), joint targets and context likewise.
 
     Args:

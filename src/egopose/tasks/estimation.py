@@ -20,7 +20,7 @@ class Estimation(ImitationTask):
     name, protocol = "estimation", "estimates"
 
     def transforms(self, config: Mapping[str, Any], dataset: Dataset, problem: Problem) -> list[Transform]:
-        """Those of imitation, with the error against the regressor's state before them where the model reads it."""
+        """Those of imitation. If the model reads the tracking error, it comes before them."""
         transforms = super().transforms(config, dataset, problem)
         if "tracking_error" not in config["model"]["inputs"]:
             return transforms

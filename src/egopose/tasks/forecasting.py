@@ -30,9 +30,9 @@ class Forecasting(ImitationTask):
         return int(config["task"]["context"])
 
     def check(self, config: Mapping[str, Any]) -> None:
-        """Raises InputError: the policy would read what is known only once the future was seen."""
+        """Raises InputError: the policy would see the future."""
         task, model = config["task"], config["model"]
-        if config.get("forecaster") is not None:  # these stand in the regressor's place, and know the context alone
+        if config.get("forecaster") is not None:  # these replace the regressor, and depend on the context alone
             if task["action"]["reference"] != "rest" or model["context"]["source"] != "frozen":
                 cause = "a forecaster is for task=forecasting_follow model=forecasting_follow"
                 raise InputError("configuration", "forecaster", cause)
@@ -47,7 +47,7 @@ class Forecasting(ImitationTask):
             raise InputError("configuration", "model.context", cause)
 
     def transforms(self, config: Mapping[str, Any], dataset: Dataset, problem: Problem) -> list[Transform]:
-        """The forecast that is followed, where there is one, the state's normaliser and the time left."""
+        """The kinematic forecast, if there is one, the state's normaliser and the time left."""
         time_left = TimeLeft(int(config["task"]["horizon"]) - 1)
         if dataset.forecasts is None:
             return [*super().transforms(config, dataset, problem), time_left]
@@ -64,7 +64,7 @@ class Forecasting(ImitationTask):
 
 
 def _track_forecast(config: Mapping[str, Any], dataset: Dataset) -> TrackForecast:
-    """What the policy sees of the forecasts it follows, as ``task.follow`` says."""
+    """The policy's observations of the forecasts it follows, as ``task.follow`` says."""
     assert dataset.forecasts is not None
     task, humanoid = config["task"], dataset.humanoid
     if not isinstance(task.get("follow"), Mapping):

@@ -1,4 +1,4 @@
-"""What tasks share whose bodies imitate reference motion."""
+"""The common part of tasks whose bodies imitate reference motion."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ class ImitationTask:
         )
 
     def transforms(self, config: Mapping[str, Any], dataset: Dataset, problem: Problem) -> list[Transform]:
-        """The visual context, where it is the regressor's, and the state's normaliser."""
+        """The visual context, if it is the regressor's, and the state's normaliser."""
         normalizer = StateNormalizer(problem.observation_sizes["humanoid_state"])
         if config["model"]["context"]["source"] != "frozen":
             return [normalizer]

@@ -1,8 +1,9 @@
-"""The task: a value that the rest of the pipeline asks, so that nobody asks for its name.
+"""The task: one value holds everything that differs between tasks, so no other code tests a task's name.
 
 A task is a file of this room that ends in ``TASK = ...``, and a file of ``conf/task`` whose ``name`` is the file's. A
 task outside of the package is a module that the environment variable ``EGOPOSE_TASKS`` names (several with commas
-between), or an entry point of the group ``egopose.tasks``. A configuration alone can make nothing be imported.
+between), or an entry point of the group ``egopose.tasks``. A configuration alone cannot make the program import
+anything.
 """
 
 from __future__ import annotations
@@ -23,13 +24,13 @@ from egopose.envs.problem import Problem
 from egopose.envs.starts import Starts
 from egopose.tasks.dataset import Dataset
 
-#: Modules of one's own that hold tasks, with commas between.
+#: The environment variable that names modules with tasks, separated by commas.
 VARIABLE = "EGOPOSE_TASKS"
 GROUP = "egopose.tasks"
 
 
 class Sources(Protocol):
-    """What a task can make its dataset of; the pipeline gives it."""
+    """The data from which a task can make its dataset; the pipeline provides it."""
 
     def motions(self) -> Dataset:
         """Humanoid, reference and fragments: no video is rendered or looked at."""
@@ -52,7 +53,7 @@ class Task(Protocol):
     protocol: str
 
     def context(self, config: Mapping[str, Any]) -> int | None:
-        """Frames that are seen before an episode begins; None where it begins with what it sees."""
+        """Frames that are seen before an episode begins; None if an episode begins with its first seen frame."""
         ...
 
     def check(self, config: Mapping[str, Any]) -> None:
@@ -78,7 +79,7 @@ class Task(Protocol):
         ...
 
     def transforms(self, config: Mapping[str, Any], dataset: Dataset, problem: Problem) -> list[Transform]:
-        """Of the observation, in their order; ``dataset`` as of :meth:`followed`."""
+        """Transforms of the observation, in their order; ``dataset`` is that of :meth:`followed`."""
         ...
 
     def starts(

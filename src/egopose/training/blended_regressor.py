@@ -77,7 +77,7 @@ class KernelSettings:
 
     @property
     def limb_numbers(self) -> int:
-        """Numbers of a frame that come from the limb finder."""
+        """Numbers of a frame that come from the body-part estimator."""
         return 0 if self.body_parts is None else 2 * load_body_part_estimator(self.body_parts).numbers
 
     def windows(self) -> TimeWindows:

@@ -37,7 +37,7 @@ class Clip:
 
     Args:
         motion: what is shown solid.
-        reference: the true motion, shown as a ghost, or None.
+        reference: the true motion, shown transparent, or None.
         futures: other drawn futures of a forecast, each as long as ``motion``.
         forecast: ``motion`` is itself a future; the poses to come are shown fading.
         curves: figures per frame by name, each ``[T]``, NaN where there is none.

@@ -80,7 +80,7 @@ class LiveViewer:
         )
         scene, gui = self._server.scene, self._server.gui
         self._mesh = scene.add_mesh_simple("/world/live", rest, self._surface.faces, color=_BODY)
-        self._ghosts = [
+        self._poses_ahead = [
             scene.add_mesh_simple(
                 f"/world/ahead{ahead}", rest, self._surface.faces, color=_BODY, opacity=opacity, cast_shadow=False,
                 visible=False,
@@ -161,11 +161,11 @@ class LiveViewer:
 
     def _show_ahead(self, coming: _Coming, root: Array) -> None:
         """The poses some frames after the one shown, as far as the newest forecast reaches."""
-        for ghost, (ahead, _) in zip(self._ghosts, AHEAD, strict=True):
+        for shape, (ahead, _) in zip(self._poses_ahead, AHEAD, strict=True):
             row = self.frame + ahead - coming.frame - 1
-            ghost.visible = 0 <= row < len(coming.qpos)
-            if ghost.visible:
-                ghost.vertices = self._surface.posed(coming.positions[row] - root, coming.quats[row])
+            shape.visible = 0 <= row < len(coming.qpos)
+            if shape.visible:
+                shape.vertices = self._surface.posed(coming.positions[row] - root, coming.quats[row])
         self._joint.visible = True
         self.forecast = coming.frame
 

@@ -1,4 +1,4 @@
-"""What limb finders learn from: pairs of pictures of random bodies in random rooms, where limbs are known.
+"""Training data of body-part estimators: pairs of pictures of random bodies in random rooms, with known limbs.
 
 A body takes its posture from a clip, its limbs pulled towards random angles; rooms, clothes, lamps and the way the
 camera is worn are those of rendered takes, the rooms of seeds that no take has. A sample is the wearer's view at two
@@ -169,7 +169,7 @@ class Scenes:
             cause = f"is {self.settings.first_room}, and takes are seen in the rooms up to {rooms - 1}"
             raise InputError("conf/body_parts.yaml: pictures", "first_room", cause)
         if self.flow.stored_size != FLOW:
-            raise InputError("vision.flow", "stored_size", f"is {self.flow.stored_size}; limb finders see {FLOW}")
+            raise InputError("vision.flow", "stored_size", f"is {self.flow.stored_size}; the estimator reads {FLOW}")
         if not self.clips or min(len(clip) for clip in self.clips) < 2:
             raise InputError("conf/body_parts.yaml", "motions", "no clip of two frames or more")
 

@@ -1,7 +1,7 @@
-"""Where the wearer's own limbs are in the picture: a small network that finds them, and what posture they show.
+"""The body-part estimator: a small network that finds the wearer's own limbs in the picture, and their posture.
 
-Yuan & Kitani 2019 see through optical flow alone, in which arms that hardly move the head leave no trace. This looks at
-the picture itself: two frames, small, and the flow between them. It is trained on rendered bodies in random postures
+Yuan & Kitani 2019 use optical flow alone. Arms that hardly move the head leave no trace in it. This network looks at
+the picture itself: two small frames and the flow between them. It is trained on rendered bodies in random postures
 and rooms (``python -m egopose.train --config-name body_parts``), on no frame of any take that anything is judged on.
 """
 
@@ -22,7 +22,7 @@ from egopose.vision.video import Frame
 PICTURE, FLOW = 64, 32
 #: Classes of the masks.
 LIMBS = ("right arm", "left arm", "right leg", "left leg", "trunk")
-#: Least and largest logarithm of a variance that a finder gives.
+#: Least and largest logarithm of a variance that an estimator gives.
 LOG_VARIANCE = (-4.0, 3.0)
 _FLOW_SCALE = 20.0  # as conf/vision/light.yaml: flow in widths a frame, times this, is of order one
 _SUMMARY = 256
@@ -47,7 +47,7 @@ class _Residual(nn.Module):
 
 
 class BodyPartEstimator(nn.Module):
-    """Pictures and flow -> masks of the limbs, and the posture they show with how sure that is.
+    """Pictures and flow -> masks of the limbs, and their posture with its uncertainty.
 
     Args:
         numbers: Q, of a posture.

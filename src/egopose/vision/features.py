@@ -27,7 +27,7 @@ def extract_flow(
     camera: Camera | None = None,
     finder: BodyPartEstimator | None = None,
 ) -> NDArray[np.float16]:
-    """Flow of a video in step with a motion, and what a limb finder makes of its pictures.
+    """Flow of a video in step with a motion, and body parts that are found in its pictures.
 
     Args:
         path: any MP4.
@@ -36,7 +36,7 @@ def extract_flow(
         offset: sync offset (s): what the motion shows at t, the video shows at t + offset.
         count: frames of the motion; None takes the video to its end.
         camera: lens, shutter and rate of a real camera, to be undone.
-        finder: of limbs; None for flow alone.
+        finder: the body-part estimator; None for flow alone.
 
     Returns:
         ``[T, 2, S, S]`` float16, image widths per frame; frame t's is from t-1 to t, frame 0's is zero. With a finder

@@ -87,8 +87,8 @@ def rotate_back(heading: Tensor, v: Tensor) -> Tensor:
 def half_angle_between(p: Tensor, q: Tensor) -> Tensor:
     """Half the angle ``[...]`` (rad, at most pi/2) of the rotation ``p * conj(q)``, the short way round.
 
-    Of unit vectors in four dimensions: the angle between p and q or -q, whichever is nearer, as
-    ``2 atan2(|p - q|, |p + q|)`` (Kahan), which keeps its precision at small angles; arccos loses half the digits.
+    It is the angle in four dimensions between p and the nearer of q and -q, as ``2 atan2(|p - q|, |p + q|)``
+    (Kahan). This keeps its precision at small angles, where arccos loses half the digits.
     """
     apart = torch.linalg.vector_norm(p - q, dim=-1)
     together = torch.linalg.vector_norm(p + q, dim=-1)

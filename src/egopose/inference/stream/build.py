@@ -142,7 +142,7 @@ def load_forecaster(values: Mapping[str, Any], trained: Trained) -> Forecaster |
     if body_part_estimator_name(source_config["regressor"]) != body_part_estimator_name(
         trained.source_config["regressor"]
     ):
-        cause = "another limb finder than the estimating run's: train both with one regressor"
+        cause = "another body-part estimator than the estimating run's: train both with one regressor"
         raise InputError(folder, "regressor.kernel.body_parts", cause)
     frames = (task_of(config).context(config) or 0) + int(config["task"]["minimum"])
     dataset = still_frames(humanoid, regressor, source_config, frames)

@@ -43,8 +43,8 @@ _RATES = (5.0, 240.0)
 class ReconnectSettings:
     """``reconnect`` of ``conf/stream.yaml``: what happens when a camera or an address gives no more pictures.
 
-    It is opened anew after ``first`` seconds, then after twice as long each time but ``longest`` at most, until
-    pictures come; after ``give_up`` seconds without one the stream ends with an error.
+    It is opened again after ``first`` seconds. Each further trial waits twice as long, ``longest`` at most, until
+    pictures come. After ``give_up`` seconds without a picture the stream ends with an error.
 
     Args:
         first, longest: s between trials.

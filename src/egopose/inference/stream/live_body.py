@@ -1,7 +1,7 @@
 """The humanoid of a live stream: policy, fail-safe and physics, one frame at a time.
 
-As :func:`egopose.inference.estimator.estimate_takes` does over whole takes, with the same environment's own parts; but
-nothing is looked up in tables over all frames, for there are none: only the frame before and the present one are kept.
+It does what :func:`egopose.inference.estimator.estimate_takes` does over whole takes, with parts of the same
+environment. But there are no tables over all frames: only the previous and the present frame are kept.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
-"""ReferenceForecasts of a live body: the forecasting policy from one moment on, in worlds of its own.
+"""Forecasts of a live body: the forecasting policy from one moment on, in physics of its own.
 
-As :func:`egopose.inference.forecaster.forecast` does with an environment, step by step to the same numbers, but with
-the policy's networks and the physics alone: beside a live stream every millisecond in Python is one that it waits.
+It gives the same numbers as :func:`egopose.inference.forecaster.forecast`, step by step, with the policy's networks
+and the physics alone. Beside a live stream every millisecond in Python makes the stream wait.
 """
 
 from __future__ import annotations

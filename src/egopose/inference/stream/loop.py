@@ -1,8 +1,8 @@
 """The live loop: one thread reads the source, this one does the rest, frame by frame, and never falls behind.
 
-The rule for late frames: only the newest frame waits (:class:`NewestFrame`). A frame that was skipped has no flow of
-its own; the flow from the last frame used to the next one is shared evenly by the control frames between, so that the
-body keeps in step with time. Where more than ``bridge`` frames are missing the rest are jumped over.
+The rule for late frames: only the newest frame waits (:class:`NewestFrame`). A skipped frame has no flow of its own.
+The control frames between two used frames share the flow between these evenly, so the body stays in step with time. If
+more than ``bridge`` frames are missing, the rest are skipped.
 
 Forecasts have a thread of their own (:class:`ForecastThread`), which is handed copies and never waited for.
 """
