@@ -27,13 +27,13 @@ from egopose.core.runtime import end_with_parent
 from egopose.data.feasibility import contact_residual
 from egopose.data.prepare_motion import PreparationSettings, reference_motion
 from egopose.data.reference import reference_states, supported
+from egopose.data.source_reading import read_source
 from egopose.data.take_sources import TakeSource, find_sources
 from egopose.humanoid.config import HumanoidConfig, SimConfig
 from egopose.humanoid.foot_geometry import lowest_points
 from egopose.humanoid.model import HumanoidModel, build_humanoid
 from egopose.humanoid.physics import BatchedPhysics
 from egopose.motion import rotations as rot
-from egopose.motion.io import read_motion
 from egopose.motion.motion import Motion
 from egopose.motion.rotations import Array
 
@@ -77,13 +77,27 @@ class GateResult:
         return float(np.mean(self.root_reward))
 
     @property
+    def cause(self) -> str:
+        """Why the clip cannot be followed; empty where it can."""
+        if not self.starts:
+            return (
+                f"no start: a body on a bare floor could be in {self.supported:.0%} of the frames, and contact with it "
+                f"can have made {self.feasible:.0%}"
+            )
+        causes = []
+        if not self.mean_height_error <= LARGEST_HEIGHT_ERROR:
+            error, bias = 100 * self.mean_height_error, 100 * float(np.mean(self.height_bias))
+            causes.append(
+                f"the root is {error:.2f} cm off in height ({bias:+.2f}), over {100 * LARGEST_HEIGHT_ERROR:g}"
+            )
+        if not self.mean_root_reward > LEAST_ROOT_REWARD:
+            causes.append(f"the root's reward is {self.mean_root_reward:.3f}, not over {LEAST_ROOT_REWARD:g}")
+        return "; ".join(causes)
+
+    @property
     def passed(self) -> bool:
         """Whether the clip can be followed; one without a start cannot."""
-        return (
-            self.starts > 0
-            and self.mean_height_error <= LARGEST_HEIGHT_ERROR
-            and self.mean_root_reward > LEAST_ROOT_REWARD
-        )
+        return not self.cause
 
 
 def open_loop_gate(humanoid: HumanoidModel, clip: Motion, threads: int = 1, *, every_start: bool = False) -> GateResult:
@@ -190,7 +204,7 @@ def _parts(text: str) -> tuple[HumanoidModel, PreparationSettings]:
 
 def _gate_source(config: str, every_start: bool, source: TakeSource) -> GateResult:
     humanoid, settings = _parts(config)
-    clip, _ = reference_motion(read_motion(source.motion, **source.options), humanoid, settings, source.mapping)
+    clip, _ = reference_motion(read_source(source), humanoid, settings, source.mapping)
     return open_loop_gate(humanoid, clip, every_start=every_start)
 
 
