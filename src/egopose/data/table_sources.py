@@ -170,10 +170,12 @@ def _row(
         cause = f"must be {' or '.join(PARTS)}, not {cell('split')!r:.60}"
         raise InputError(path, f"line {number}, {columns.split}", cause)
     file = Path(cell("file"))
+    if file.is_absolute() or ".." in file.parts:
+        raise InputError(path, f"line {number}, {columns.file}", f"{cell('file')!r:.60} lies outside data.folder")
     stem = file.name.split(".")[0]
     frames, skip = number_of("frames", 1, True), number_of("skip", 0, True)
     return TableRow(
-        name=stem if stems[stem] == 1 else f"{file.parent.name}-{stem}",
+        name=stem if stems[stem] == 1 else "-".join([*file.parent.parts, stem]),
         file=folder / file,
         subject=cell("subject"),
         group=cell("group"),
