@@ -78,7 +78,7 @@ class ImitationTask:
         if whole_fragments:
             return WholeFragments(fragments, takes.offsets, takes.lengths)
         horizon, minimum = task["horizon"], task["minimum"]
-        limits = config["data"].get("shares")
+        limits = config.get("data", {}).get("shares")
         shares = StartShares(takes.groups, limits) if limits else None
         return training_starts(task.get("starts"), fragments, takes.offsets, takes.lengths, horizon, minimum, shares)
 
