@@ -17,11 +17,12 @@ def store_report(store: TakeStore, split: Mapping[str, Any] | None = None) -> st
         store: of a set.
         split: ``conf/data``'s ``split``, for what each person trains and tests; None for neither.
     """
-    lines = [f"{'take':<34}{'subject':>9}{'frames':>8}{'seconds':>9}{'retarget mm':>13}{'on floor':>10}  video"]
+    wide = max([9, *(len(take.subject) + 2 for take in store.takes)])
+    lines = [f"{'take':<34}{'subject':>{wide}}{'frames':>8}{'seconds':>9}{'retarget mm':>13}{'on floor':>10}  video"]
     for take in store.takes:
         feasible = sum(b - a for a, b in take.supported) / take.length
         lines.append(
-            f"{take.name:<34}{take.subject:>9}{take.length:>8}{take.length / store.fps:>9.1f}"
+            f"{take.name:<34}{take.subject:>{wide}}{take.length:>8}{take.length / store.fps:>9.1f}"
             f"{take.retargeting_mm:>13.1f}{feasible:>10.0%}  {_video(take)}"
         )
     lines += [f"{take.name}: {note}" for take in store.takes for note in take.notes]
