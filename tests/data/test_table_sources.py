@@ -14,6 +14,7 @@ from helpers.rigs import PLAIN, STANDING, write_rig
 
 from egopose.core.config import compose_config
 from egopose.core.errors import InputError
+from egopose.data import gate
 from egopose.data.preparation import fingerprint_of, prepare
 from egopose.data.report import minutes_by_person, store_report
 from egopose.data.source_reading import read_source
@@ -161,6 +162,17 @@ def test_two_workers_make_the_same_store_as_one(made: tuple[dict[str, Any], Take
     other = prepare({**config, "data": data}, progress=False, flow=False)
     assert len(store.card["checksums"]) > len(store.takes)
     assert other.card == store.card
+
+
+def test_the_gates_command_goes_on_past_a_refused_clip(
+    made: tuple[dict[str, Any], TakeStore], capsys: pytest.CaptureFixture[str]
+) -> None:
+    config, store = made
+    gate.main([f"data.folder={config['data']['folder']}", "data=cmu_people", "sim=fast"])
+    lines = capsys.readouterr().out.splitlines()[2:]
+    assert [line.split(" | ")[0] for line in lines[:4]] == ["| walk", "| ben", "| cut", "| z_up"]
+    assert "refused: line 149: frame 20 of 45" in lines[2]
+    assert lines[-1].startswith(f"{sum(not take.gate for take in store.takes)} of 4 clips pass")
 
 
 def test_a_set_may_stop_at_what_it_cannot_use(folder: Path) -> None:
