@@ -19,11 +19,14 @@ def main(config: DictConfig) -> None:
     from egopose.data.report import store_report
 
     try:
-        store = prepare(resolved(config))
+        values = resolved(config)
+        if values["stages"] not in ("all", "motion"):
+            raise InputError("conf/prepare.yaml", "stages", f"must be all or motion, not {values['stages']!r:.60}")
+        store = prepare(values, flow=values["stages"] == "all")
     except InputError as error:
         print(f"error: {error}", file=sys.stderr)
         raise SystemExit(2) from None
-    print(store_report(store))
+    print(store_report(store, values["data"]["split"]))
 
 
 if __name__ == "__main__":

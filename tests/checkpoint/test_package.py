@@ -146,6 +146,19 @@ def test_a_path_that_was_overlooked_is_refused(run: Path, tmp_path: Path) -> Non
         package_run(settings(run, tmp_path / "out", name="../up"), describe_run)
 
 
+@pytest.mark.parametrize("group", ["bandai", "tennis", "people"])
+def test_weights_of_data_whose_licence_forbids_it_are_not_packaged(group: str, run: Path, tmp_path: Path) -> None:
+    copy = shutil.copytree(run, tmp_path / "run")
+    made = find_checkpoint(copy)
+    value = made / Checkpoint.manifest(made)["components"]["config"]["path"] / "value.json"
+    data = compose_config("prepare", [f"data={group}"])["data"]
+    value.write_text(json.dumps({**json.loads(value.read_text()), "data": data}))
+    seal(made)
+    with pytest.raises(InputError, match=f"data.ship: the licence of the set {group} does not let weights"):
+        package_run(settings(copy, tmp_path / "out"), describe_run)
+    assert not (tmp_path / "out").exists()
+
+
 def test_figures_are_means_with_intervals_and_the_first_is_divided(run: Path, tmp_path: Path) -> None:
     raws = {}
     for method, scale in (("ours", 1.0), ("PoseReg", 2.0)):

@@ -24,7 +24,7 @@ from hypothesis import strategies as st
 from egopose.benchmarks.process_memory import mapped_mb
 from egopose.core.config import compose_config
 from egopose.core.errors import InputError
-from egopose.data import preparation
+from egopose.data import motion_stage, preparation
 from egopose.data.preparation import fingerprint_of, flow_name, global_spans, humanoid_of, prepare, store_folder
 from egopose.data.prepare_motion import reference_motion
 from egopose.data.reference import supported
@@ -233,7 +233,7 @@ def test_a_store_cut_off_while_its_motions_were_made_is_made_again(
             raise KeyboardInterrupt
         return real(*arguments)  # type: ignore[arg-type]
 
-    monkeypatch.setattr(preparation, "reference_motion", stops_at_the_second)
+    monkeypatch.setattr(motion_stage, "reference_motion", stops_at_the_second)
     with pytest.raises(KeyboardInterrupt):
         prepare(config, progress=False, flow=False)
     assert not (tmp_path / "store").exists()
@@ -476,7 +476,7 @@ def test_runs_of_a_mask(mask: list[bool]) -> None:
         ({"subjects": ["7"]}, "subjects: no such subjects: 7"),
         ({"kind": "subject", "test_subjects": [9]}, "test_subjects: no such subjects: 9"),
         ({"kind": "subject"}, "test_subjects"),
-        ({"kind": "weekday"}, "kind: must be time or subject, not 'weekday'"),
+        ({"kind": "weekday"}, "kind: must be time, subject or table, not 'weekday'"),
         ({"shortest": 5000}, "train: leaves no fragment of 5000 frames"),
         ({"train_share": 1.4}, "train_share"),
         ({"train_share": None}, "train_share"),
@@ -544,7 +544,7 @@ def folder(tmp_path: Path) -> Path:
         ({"subject": "(x)"}, r"a_1\.bvh: data\.subject: '\(x\)' does not match"),
         ({"subject": "a|b"}, r"data\.subject"),
         ({"subject": "(a"}, r"data\.subject"),
-        ({"source": "internet"}, "source: must be embedded, folder or takes, not 'internet'"),
+        ({"source": "internet"}, "source: must be embedded, folder, table or takes, not 'internet'"),
     ],
 )
 def test_a_wrong_folder_setting_is_named(folder: Path, change: dict[str, Any], message: str) -> None:

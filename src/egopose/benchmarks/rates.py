@@ -11,10 +11,10 @@ from egopose.core.config import compose_config
 from egopose.data.gate import feasible_starts
 from egopose.data.prepare_motion import PreparationSettings, reference_motion
 from egopose.data.rates import Starts, compare_rates
+from egopose.data.source_reading import read_source
 from egopose.data.take_sources import find_sources
 from egopose.humanoid.config import HumanoidConfig, SimConfig
 from egopose.humanoid.model import build_humanoid
-from egopose.motion.io import read_motion
 from egopose.motion.motion import finite_difference
 
 #: Physics steps a control step that are compared; the first is the measure of the others.
@@ -41,7 +41,7 @@ def run(overrides: Sequence[str], rounds: int) -> dict[str, Any]:
     settings = PreparationSettings.from_mapping(config["data"].get("preparation") or {})
     parts = []
     for source in find_sources(config["data"]):
-        clip, _ = reference_motion(read_motion(source.motion, **source.options), humanoids[0], settings, source.mapping)
+        clip, _ = reference_motion(read_source(source), humanoids[0], settings, source.mapping)
         starts = feasible_starts(humanoids[0], clip)
         parts.append(Starts.of(clip.qpos, finite_difference(clip.qpos, clip.fps), starts))
     together = Starts(*(np.concatenate(field) for field in zip(*parts, strict=True)))

@@ -11,8 +11,8 @@ import numpy as np
 from egopose.core.config import compose_config
 from egopose.data.preparation import humanoid_of
 from egopose.data.prepare_motion import PreparationSettings, reference_motion, without_lead_in
+from egopose.data.source_reading import read_source
 from egopose.data.take_sources import find_sources
-from egopose.motion.io import read_motion
 from egopose.motion.retarget import retarget
 
 
@@ -40,7 +40,7 @@ def run(overrides: Sequence[str], rounds: int) -> dict[str, Any]:
     fps = 2.0 / humanoid.control_dt
     jobs = []
     for source in find_sources(data):
-        motion = without_lead_in(read_motion(source.motion, **source.options))
+        motion = without_lead_in(read_source(source))
         jobs.append((motion.resample(fps) if motion.fps > fps else motion, source.mapping))
     frames = sum(len(motion) for motion, _ in jobs)
     alone, whole, errors = [], [], []

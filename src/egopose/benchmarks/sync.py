@@ -11,9 +11,9 @@ from egopose.core.config import compose_config
 from egopose.core.errors import InputError
 from egopose.data.preparation import prepare
 from egopose.data.prepare_motion import without_lead_in
+from egopose.data.source_reading import read_source
 from egopose.data.sync_offset import find_offset, head_turning, settings_of, video_turning
 from egopose.data.take_sources import find_sources
-from egopose.motion.io import read_motion
 from egopose.motion.motion import Motion
 from egopose.motion.rotations import Array
 from egopose.vision.flow import FlowConfig
@@ -40,7 +40,7 @@ def run(overrides: Sequence[str], rounds: int) -> dict[str, Any]:
     store = prepare(config, flow=False)
     store = prepare(config) if any(not store.video(i).is_file() for i in range(len(store.takes))) else store
     flow, rng = FlowConfig(**config["vision"]["flow"]), np.random.default_rng(0)
-    motions = {s.name: without_lead_in(read_motion(s.motion, **s.options)) for s in find_sources(config["data"])}
+    motions = {s.name: without_lead_in(read_source(s)) for s in find_sources(config["data"])}
     turning = {
         take.name: video_turning(store.video(i), Camera(), flow, settings.rate, settings.field_of_view)
         for i, take in enumerate(store.takes)

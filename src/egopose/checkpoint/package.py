@@ -55,8 +55,8 @@ def package_run(values: Mapping[str, Any], describe: Describe) -> Path:
         The folder.
 
     Raises:
-        InputError: the run is damaged or unfinished, its configuration names a file of this machine, or a setting or
-            raw result is wrong.
+        InputError: the run is damaged or unfinished, its data's licence forbids it (``data.ship``), its configuration
+            names a file of this machine, or a setting or raw result is wrong.
     """
     run, name = Path(str(values["run"])), str(values["name"])
     if not re.fullmatch(r"[a-z][a-z0-9_]*", name):
@@ -65,6 +65,9 @@ def package_run(values: Mapping[str, Any], describe: Describe) -> Path:
     checkpoint = find_checkpoint(run, str(values["which"]))
     run = checkpoint.resolve().parents[1]
     config = without_places(read_json(checkpoint, "config"), checkpoint)
+    if config["data"].get("ship", True) is not True:
+        cause = f"the licence of the set {config['data'].get('name')} does not let weights trained on it be given away"
+        raise InputError(checkpoint, "data.ship", cause)
     part = out.with_name(f"{out.name}.part")
     shutil.rmtree(part, ignore_errors=True)
     part.mkdir(parents=True)

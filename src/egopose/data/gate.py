@@ -27,13 +27,13 @@ from egopose.core.runtime import end_with_parent
 from egopose.data.feasibility import contact_residual
 from egopose.data.prepare_motion import PreparationSettings, reference_motion
 from egopose.data.reference import reference_states, supported
+from egopose.data.source_reading import read_source
 from egopose.data.take_sources import TakeSource, find_sources
 from egopose.humanoid.config import HumanoidConfig, SimConfig
 from egopose.humanoid.foot_geometry import lowest_points
 from egopose.humanoid.model import HumanoidModel, build_humanoid
 from egopose.humanoid.physics import BatchedPhysics
 from egopose.motion import rotations as rot
-from egopose.motion.io import read_motion
 from egopose.motion.motion import Motion
 from egopose.motion.rotations import Array
 
@@ -77,13 +77,27 @@ class GateResult:
         return float(np.mean(self.root_reward))
 
     @property
+    def cause(self) -> str:
+        """Why the clip cannot be followed; empty where it can."""
+        if not self.starts:
+            return (
+                f"no start: a body on a bare floor could be in {self.supported:.0%} of the frames, and contact with it "
+                f"can have made {self.feasible:.0%}"
+            )
+        causes = []
+        if not self.mean_height_error <= LARGEST_HEIGHT_ERROR:
+            error, bias = 100 * self.mean_height_error, 100 * float(np.mean(self.height_bias))
+            causes.append(
+                f"the root is {error:.2f} cm off in height ({bias:+.2f}), over {100 * LARGEST_HEIGHT_ERROR:g}"
+            )
+        if not self.mean_root_reward > LEAST_ROOT_REWARD:
+            causes.append(f"the root's reward is {self.mean_root_reward:.3f}, not over {LEAST_ROOT_REWARD:g}")
+        return "; ".join(causes)
+
+    @property
     def passed(self) -> bool:
         """Whether the clip can be followed; one without a start cannot."""
-        return (
-            self.starts > 0
-            and self.mean_height_error <= LARGEST_HEIGHT_ERROR
-            and self.mean_root_reward > LEAST_ROOT_REWARD
-        )
+        return not self.cause
 
 
 def open_loop_gate(humanoid: HumanoidModel, clip: Motion, threads: int = 1, *, every_start: bool = False) -> GateResult:
@@ -161,8 +175,8 @@ def root_reward(qpos: Array, reference: Array) -> Array:
 
 def gate_sources(
     config: Mapping[str, Any], workers: int = 1, *, every_start: bool = False
-) -> Iterator[tuple[str, GateResult]]:
-    """Name and result of every clip of a configuration's data set, in order.
+) -> Iterator[tuple[str, GateResult | InputError]]:
+    """Name and result of every clip of a configuration's data set, in order; of a refused clip the cause.
 
     Args:
         config: resolved; groups ``data humanoid sim``.
@@ -170,7 +184,7 @@ def gate_sources(
         every_start: see :func:`open_loop_gate`.
 
     Raises:
-        InputError: a source cannot be used.
+        InputError: a source cannot be used, and ``data.on_refused`` is not ``skip``.
     """
     sources = find_sources(config["data"])
     work = partial(_gate_source, json.dumps(config, default=str), every_start)
@@ -182,15 +196,21 @@ def gate_sources(
 
 
 @lru_cache(maxsize=1)
-def _parts(text: str) -> tuple[HumanoidModel, PreparationSettings]:
+def _parts(text: str) -> tuple[HumanoidModel, PreparationSettings, str]:
     config = json.loads(text)
     humanoid = build_humanoid(HumanoidConfig.from_mapping(config["humanoid"]), SimConfig(**config["sim"]))
-    return humanoid, PreparationSettings.from_mapping(config["data"].get("preparation") or {})
+    preparation = PreparationSettings.from_mapping(config["data"].get("preparation") or {})
+    return humanoid, preparation, str(config["data"].get("on_refused", "stop"))
 
 
-def _gate_source(config: str, every_start: bool, source: TakeSource) -> GateResult:
-    humanoid, settings = _parts(config)
-    clip, _ = reference_motion(read_motion(source.motion, **source.options), humanoid, settings, source.mapping)
+def _gate_source(config: str, every_start: bool, source: TakeSource) -> GateResult | InputError:
+    humanoid, settings, on_refused = _parts(config)
+    try:
+        clip, _ = reference_motion(read_source(source), humanoid, settings, source.mapping)
+    except InputError as error:
+        if on_refused != "skip":
+            raise
+        return error
     return open_loop_gate(humanoid, clip, every_start=every_start)
 
 
@@ -200,8 +220,10 @@ HEADER = (
 )
 
 
-def row(name: str, result: GateResult) -> str:
+def row(name: str, result: GateResult | InputError) -> str:
     """One line of a Markdown table."""
+    if isinstance(result, InputError):
+        return f"| {name} | | | | | | refused: {result.field}: {result.cause} |"
     errors = ", ".join(
         f"{100 * e:.2f} ({100 * b:+.2f})" for e, b in zip(result.height_error, result.height_bias, strict=True)
     )
@@ -211,6 +233,11 @@ def row(name: str, result: GateResult) -> str:
         f"| {errors}: mean {100 * result.mean_height_error:.2f} "
         f"| {rewards}: mean {result.mean_root_reward:.3f} | {'' if result.passed else 'fails'} |"
     )
+
+
+def _json(name: str, result: GateResult | InputError) -> str:
+    refused = isinstance(result, InputError)
+    return json.dumps({"clip": name} | ({"refused": str(result)} if refused else vars(result)))
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -228,12 +255,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
             print(HEADER)
         for name, result in gate_sources(config, options.workers, every_start=options.every_start):
             results.append(result)
-            print(json.dumps({"clip": name, **vars(result)}) if options.json else row(name, result), flush=True)
+            print(_json(name, result) if options.json else row(name, result), flush=True)
     except InputError as error:
         print(f"error: {error}", file=sys.stderr)
         raise SystemExit(2) from None
     if not options.json:
-        passed = sum(r.passed for r in results)
+        passed = sum(isinstance(r, GateResult) and r.passed for r in results)
         print(f"\n{passed} of {len(results)} clips pass (sim: {config['sim']['substeps']} substeps)")
 
 

@@ -6,31 +6,26 @@ import hashlib
 import json
 import os
 from collections.abc import Mapping
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from tensordict import TensorDict
 
 from egopose.core.errors import InputError
 from egopose.data.lock import store_lock
-from egopose.data.prepare_motion import PreparationSettings, reference_motion
-from egopose.data.reference import reference_states, supported
-from egopose.data.store import Fragment, TakeInfo, TakeStore, runs_of
-from egopose.data.sync_offset import settings_of, sync_offset
-from egopose.data.take_sources import TakeSource, find_sources
+from egopose.data.motion_stage import PreparedTake, prepared_takes
+from egopose.data.store import REFERENCE_KEYS, Fragment, LeftOut, TakeInfo, TakeStore, runs_of
+from egopose.data.table_sources import left_out_rows
+from egopose.data.take_sources import find_sources
 from egopose.humanoid.config import HumanoidConfig, SimConfig
-from egopose.humanoid.foot_geometry import lowest_points
 from egopose.humanoid.model import HumanoidModel, build_humanoid
-from egopose.motion.io import read_motion
-from egopose.motion.motion import Motion
 from egopose.motion.notes import notes_of
-from egopose.motion.retarget import RetargetReport
 from egopose.vision.corruption import Corruption
 from egopose.vision.features import extract_flow
-from egopose.vision.flow import FlowConfig
 from egopose.vision.lens import Camera
 from egopose.vision.takes import RenderConfig, RenderJob, render_takes
 
@@ -60,9 +55,14 @@ def fingerprint_of(config: Mapping[str, Any]) -> str:
     sources = [
         [s.name, s.subject, s.motion.stat().st_size, str(s.video), s.sync_offset, s.options, s.mapping]
         + ([asdict(s.camera)] if s.camera else [])
+        + ([s.group, s.part, s.skip, s.facts] if data["source"] == "table" else [])
         for s in find_sources(data)
     ]
     parts = [sources, config["humanoid"], data.get("preparation"), config["sim"]["control_hz"], PREPARATION_VERSION]
+    if data["source"] == "table":
+        parts += [[asdict(clip) for clip in left_out_rows(data)]]
+    if data.get("gate"):
+        parts += ["gate"]
     return hashlib.sha256(json.dumps(parts, sort_keys=True, default=str).encode()).hexdigest()
 
 
@@ -107,61 +107,49 @@ def _bar(label: str, unit: str, show: bool) -> Progress:
 
 def _make_motions(config: Mapping[str, Any], root: Path, progress: bool) -> TakeStore:
     data, humanoid = config["data"], humanoid_of(config)
-    settings = PreparationSettings.from_mapping(data.get("preparation") or {})
-    sources = find_sources(data)
-    clips, infos, states, offset = [], [], [], 0
+    sources, left_out = find_sources(data), left_out_rows(data)
+    takes: list[PreparedTake] = []
     with _bar("motions", "takes", progress) as bar:
         task = bar.add_task("motions", total=len(sources))
-        for source in sources:
-            motion = read_motion(source.motion, **source.options)
-            if source.sync_offset is None:
-                source = replace(source, sync_offset=_find_offset(config, source, motion))
-            clip, report = reference_motion(motion, humanoid, settings, source.mapping)
-            body = reference_states(humanoid, clip)
-            contacts = clip.contacts if clip.contacts is not None else np.ones((len(clip), 1), dtype=bool)
-            feasible = supported(humanoid, body, contacts, clip.fps, lowest_points(humanoid, clip))
-            infos.append(_row(source, clip, report, offset, body, feasible, humanoid))
-            clips.append(clip)
-            states.append(body)
-            offset += len(clip)
+        for take in prepared_takes(config, sources):
+            if isinstance(take, LeftOut):
+                left_out.append(take)
+            else:
+                takes.append(take)
             bar.advance(task)
+    if not takes:
+        first = next(clip for clip in left_out if clip.refused)
+        raise InputError("data", first.name, f"all {len(sources)} clips are refused, this one for: {first.cause}")
     root.parent.mkdir(parents=True, exist_ok=True)
-    fps = 1.0 / humanoid.control_dt
-    return TakeStore.create(root, fps, fingerprint_of(config), infos, clips, torch.cat(states))
+    offsets = np.cumsum([0, *(len(take.clip) for take in takes)]).tolist()
+    infos = [_row(take, offset, humanoid) for take, offset in zip(takes, offsets[:-1], strict=True)]
+    states = {key: torch.from_numpy(np.concatenate([t.states[key] for t in takes])) for key in REFERENCE_KEYS}
+    reference = TensorDict(states, batch_size=[offsets[-1]])
+    clips = [take.clip for take in takes]
+    return TakeStore.create(root, 1.0 / humanoid.control_dt, fingerprint_of(config), infos, clips, reference, left_out)
 
 
-def _find_offset(config: Mapping[str, Any], source: TakeSource, motion: Motion) -> float:
-
-    assert source.video is not None
-    flow = FlowConfig(**config["vision"]["flow"])
-    result = sync_offset(source.video, motion, settings_of(config["data"]), flow, source.camera, source.mapping)
-    return result.offset
-
-
-def _row(
-    source: TakeSource,
-    clip: Motion,
-    report: RetargetReport,
-    offset: int,
-    body: Any,
-    feasible: np.ndarray,
-    humanoid: HumanoidModel,
-) -> TakeInfo:
+def _row(take: PreparedTake, offset: int, humanoid: HumanoidModel) -> TakeInfo:
+    source, clip = take.source, take.clip
     return TakeInfo(
         name=source.name,
         subject=source.subject,
         offset=offset,
         length=len(clip),
-        lowest_head_height=float(body["xpos"][:, humanoid.head, 2].min()),
+        lowest_head_height=float(take.states["xpos"][:, humanoid.head, 2].min()),
         source=source.motion.name,
         video=f"videos/{source.name}.mp4" if source.video is None else str(source.video),
         sync_offset=source.sync_offset or 0.0,
         rendered=source.video is None,
-        supported=runs_of(feasible),
-        retargeting_mm=float(np.mean([mean for mean, _ in report.position_mm.values()])),
+        supported=runs_of(take.supported),
+        retargeting_mm=float(np.mean([mean for mean, _ in take.report.position_mm.values()])),
         camera=asdict(source.camera) if source.camera else None,
         notes=notes_of(clip),
-        warnings=report.warnings,
+        warnings=take.report.warnings,
+        group=source.group,
+        part=source.part,
+        gate=take.gate,
+        feasible=take.feasible,
     )
 
 
@@ -191,6 +179,8 @@ def _make_videos(config: Mapping[str, Any], store: TakeStore, progress: bool) ->
 def _test_room_takes(config: Mapping[str, Any], store: TakeStore) -> set[int]:
     """Takes that only ever test stand in rooms no training take has seen."""
     split = config["data"]["split"]
+    if split["kind"] == "table":
+        return {i for i, take in enumerate(store.takes) if take.part == "test"}
     if split["kind"] != "subject":
         return set()
     tests = {str(s) for s in split["test_subjects"]}
@@ -211,6 +201,8 @@ def flow_name(config: Mapping[str, Any]) -> str:
     vision = config["vision"]
     parts = [vision["flow"]["preset"], vision["flow"]["working_size"], vision["flow"]["stored_size"]]
     rendered = [vision["video"], vision["camera"], vision["room"], config["data"]["split"].get("test_subjects")]
+    if config["data"]["split"]["kind"] == "table":
+        rendered.append("rooms by table")
     corruption = Corruption.from_config(config)
     known = [parts, rendered, *([asdict(corruption)] if corruption is not None else [])]
     digest = hashlib.sha256(json.dumps(known, sort_keys=True, default=str).encode()).hexdigest()

@@ -7,7 +7,7 @@ from typing import Any
 
 from egopose.core.config import convert
 from egopose.core.errors import InputError
-from egopose.data.store import Fragment, TakeInfo
+from egopose.data.store import PARTS, Fragment, TakeInfo
 
 
 def split_takes(
@@ -19,8 +19,8 @@ def split_takes(
         takes: of the store.
         settings: ``conf/data``'s ``split``: ``kind``: ``time`` (each take's first ``train_share`` trains, the rest
             tests, if it is at least ``shortest`` frames long; else the whole take trains) or ``subject`` (the takes of
-            ``test_subjects`` test, all others train); ``subjects``: the only ones used, or null for all; ``shortest``
-            frames a fragment has.
+            ``test_subjects`` test, all others train) or ``table`` (each take is for what its set's table says);
+            ``subjects``: the only ones used, or null for all; ``shortest`` frames a fragment has.
         part: ``train`` or ``test``.
         supported_only: cut fragments where no body on a bare floor could be (see
             :func:`egopose.data.reference.supported`).
@@ -54,8 +54,13 @@ def split_takes(
         elif kind == "subject":
             tests = take.subject in {str(s) for s in settings["test_subjects"]}
             start, stop = (0, take.length) if tests == (part == "test") else (0, 0)
+        elif kind == "table":
+            if take.part not in PARTS:
+                cause = f"{take.name} has no part: data.columns.split names the table's column of train and test"
+                raise InputError("data.split", "kind", cause)
+            start, stop = (0, take.length) if take.part == part else (0, 0)
         else:
-            raise InputError("data.split", "kind", f"must be time or subject, not {kind!r}")
+            raise InputError("data.split", "kind", f"must be time, subject or table, not {kind!r}")
         runs = take.supported if supported_only else ((0, take.length),)
         pieces = [(max(start, a), min(stop, b)) for a, b in runs]
         out += [Fragment(index, a, b) for a, b in pieces if b - a >= shortest]

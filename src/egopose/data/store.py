@@ -2,7 +2,8 @@
 
 A folder::
 
-    store.json            schema, fps, fingerprint of humanoid and preparation, the takes, checksums (reference, clips)
+    store.json            schema, fps, fingerprint of humanoid and preparation, the takes, what of the set was left out,
+                          checksums (reference, clips)
     clips/<take>.npz      the reference clips in the project's own format
     videos/<take>.mp4     the wearer's video (rendered, or a link to the user's own)
     reference/            TensorDict [F], float64: the body-state keys
@@ -42,6 +43,8 @@ SCHEMA = 1
 _CHECKSUMS = "checksums.json"
 #: What every frame of ``reference/`` has; see :func:`egopose.data.reference.reference_states`.
 REFERENCE_KEYS = ("qpos", "qvel", "xpos", "xquat", "com", "com_vel")
+#: What a take may be for, where its set says so.
+PARTS = ("train", "test")
 
 
 @dataclass(frozen=True)
@@ -62,6 +65,10 @@ class TakeInfo:
         camera: settings of :class:`egopose.vision.lens.Camera` of a user's own video, or None.
         notes: sentences on how its motion file was read.
         warnings: what is odd about the motion, see :mod:`egopose.motion.plausibility`.
+        group: of takes that ``data.shares`` names together.
+        part: ``train`` or ``test`` where the set says so; see the split of kind ``table``.
+        gate: why the physics gate is not passed, empty where it is; None where it was not asked.
+        feasible: share of the frames that contact with a bare floor can have made; None where it was not asked.
     """
 
     name: str
@@ -78,6 +85,29 @@ class TakeInfo:
     camera: Any = None
     notes: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
+    group: str = ""
+    part: str = ""
+    gate: str | None = None
+    feasible: float | None = None
+
+
+@dataclass(frozen=True)
+class LeftOut:
+    """A clip of the set that is not in the store.
+
+    Args:
+        name: of the clip.
+        subject: whose motion it is.
+        cause: why it was left out or refused.
+        seconds: how long it is, where that is known.
+        refused: whether it was tried and could not be used; else the set leaves it out.
+    """
+
+    name: str
+    subject: str
+    cause: str
+    seconds: float | None = None
+    refused: bool = False
 
 
 @dataclass(frozen=True)
@@ -118,6 +148,7 @@ class TakeStore:
         self._checksums = _as_checksums(path, card.get("checksums", {}))
         self.fps = float(card["fps"])
         self.takes = tuple(_take_info(path, row, number) for number, row in enumerate(card["takes"]))
+        self.left_out = _left_out(path, card.get("left_out", []))
         self.frames_total = 0
         for number, take in enumerate(self.takes):
             if take.offset != self.frames_total:
@@ -139,6 +170,7 @@ class TakeStore:
         takes: Sequence[TakeInfo],
         clips: Sequence[Motion],
         states: TensorDict,
+        left_out: Sequence[LeftOut] = (),
     ) -> TakeStore:
         """Write a new store; it appears whole, by renaming, and replaces nothing that is there.
 
@@ -149,6 +181,7 @@ class TakeStore:
             takes: rows, offsets in order.
             clips: reference clips, in step with ``takes``.
             states: ``[F]`` body states.
+            left_out: clips of the set that are not in the store.
         """
         part = root.with_name(root.name + ".part")
         shutil.rmtree(part, ignore_errors=True)
@@ -160,6 +193,7 @@ class TakeStore:
         checksums = _checksums(part, "clips", "reference")
         rows = [asdict(take) for take in takes]
         card = {"schema": SCHEMA, "fps": fps, "fingerprint": fingerprint, "takes": rows, "checksums": checksums}
+        card |= {"left_out": [asdict(clip) for clip in left_out]} if left_out else {}
         (part / "store.json").write_text(json.dumps(card, indent=1))
         os.replace(part, root)
         return cls(root)
@@ -335,6 +369,12 @@ def _take_info(path: Path, row: Any, number: int) -> TakeInfo:
     if take.camera is not None and not isinstance(take.camera, dict):
         raise InputError(path, f"{where}.camera", f"must be settings of a camera, not {take.camera!r:.60}")
     return take
+
+
+def _left_out(path: Path, rows: Any) -> tuple[LeftOut, ...]:
+    if not isinstance(rows, list) or not all(isinstance(row, dict) for row in rows):
+        raise InputError(path, "left_out", f"is damaged: must be a list of clips, not {rows!r:.60}")
+    return tuple(from_mapping(LeftOut, row, f"{path}: left_out") for row in rows)
 
 
 def runs_of(mask: np.ndarray) -> tuple[tuple[int, int], ...]:

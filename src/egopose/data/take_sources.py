@@ -1,10 +1,10 @@
-"""Where takes come from: the embedded clips, a folder of mocap files, or a user's own list of motion and video."""
+"""Where takes come from: the embedded clips, a folder or table of mocap files, or a user's list of motion and video."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from importlib.resources import files
 from itertools import islice
 from pathlib import Path
@@ -12,6 +12,7 @@ from typing import Any
 
 from egopose.core.config import convert
 from egopose.core.errors import InputError
+from egopose.data.table_sources import table_rows
 from egopose.motion.io import given_options
 from egopose.vision.lens import Camera
 
@@ -31,6 +32,10 @@ class TakeSource:
         sync_offset: s, see :class:`egopose.data.store.TakeInfo`; None: to be found (:mod:`egopose.data.sync_offset`).
         mapping: part -> joint for skeletons whose names say too little.
         camera: that took the video, or None where nothing is known of it.
+        group: of takes that ``data.shares`` names together.
+        part: ``train`` or ``test``, where the set says so of each take.
+        skip: frames before the motion, which are cut.
+        facts: what the set says of the file, see :func:`egopose.data.source_reading.read_source`.
     """
 
     name: str
@@ -41,6 +46,10 @@ class TakeSource:
     sync_offset: float | None = 0.0
     mapping: dict[str, str] | None = None
     camera: Camera | None = None
+    group: str = ""
+    part: str = ""
+    skip: int = 0
+    facts: dict[str, Any] = field(default_factory=dict)
 
 
 def find_sources(settings: Mapping[str, Any]) -> list[TakeSource]:
@@ -48,9 +57,9 @@ def find_sources(settings: Mapping[str, Any]) -> list[TakeSource]:
 
     Args:
         settings: ``source``: ``embedded``, ``folder`` (``folder``, ``pattern``: a glob; ``subject``: a regular
-            expression whose first group is the subject) or ``takes`` (a list of ``{motion, video, sync_offset, subject,
-            name, reader, mapping, camera}``); ``exclude``: take names left out; ``reader``: options for the reader;
-            ``camera``: of every take that does not say otherwise.
+            expression whose first group is the subject), ``table`` (see :mod:`egopose.data.table_sources`) or ``takes``
+            (a list of ``{motion, video, sync_offset, subject, name, reader, mapping, camera}``); ``exclude``: take
+            names left out; ``reader``: options for the reader; ``camera``: of every take that does not say otherwise.
 
     Raises:
         InputError: a file is missing or nothing is found; names the field.
@@ -64,6 +73,8 @@ def find_sources(settings: Mapping[str, Any]) -> list[TakeSource]:
                 "data", "folder", f"say where the set lies: data.folder=PATH ({settings.get('about', '')})"
             )
         result = _in_folder(Path(str(settings["folder"])).expanduser(), settings)
+    elif kind == "table":
+        result = _in_table(settings)
     elif kind == "takes":
         result = _listed(
             settings.get("takes"),
@@ -71,7 +82,7 @@ def find_sources(settings: Mapping[str, Any]) -> list[TakeSource]:
             _options(settings.get("camera"), "data.camera"),
         )
     else:
-        raise InputError("data", "source", f"must be embedded, folder or takes, not {kind!r}")
+        raise InputError("data", "source", f"must be embedded, folder, table or takes, not {kind!r}")
     names = [s.name for s in result]
     if twice := sorted({n for n in names if names.count(n) > 1}):
         raise InputError("data", "takes", f"names stand twice: {', '.join(twice)}")
@@ -103,6 +114,29 @@ def _in_folder(folder: Path, settings: Mapping[str, Any]) -> list[TakeSource]:
     if not out:
         raise InputError(folder, "data.pattern", f"{pattern!r:.60} matches no file")
     return out
+
+
+def _in_table(settings: Mapping[str, Any]) -> list[TakeSource]:
+    reader = given_options(_options(settings.get("reader"), "data.reader"))
+    rows = [row for row in table_rows(settings) if not row.reason]
+    if not rows:
+        raise InputError("data", "data.leave_out", "leaves no clip of the table")
+    if missing := [row for row in rows if not row.file.is_file()]:
+        cause = f"{len(missing)} of {len(rows)} files of the table are not there: unpack the set's archives there"
+        raise InputError(missing[0].file, "data.folder", cause)
+    return [
+        TakeSource(
+            row.name,
+            row.subject,
+            row.file,
+            dict(reader),
+            group=row.group,
+            part=row.part,
+            skip=row.skip,
+            facts={name: value for name, value in row.facts.items() if name not in reader},
+        )
+        for row in rows
+    ]
 
 
 def _expression(text: Any) -> re.Pattern[str]:

@@ -61,11 +61,13 @@ class TakeTable:
         offsets: ``[K]`` int64, first frame of each take.
         lengths: ``[K]`` int64, frames.
         lowest_head_height: ``[K]`` float64 m, the lowest the reference's head gets in the take.
+        groups: of each take, what ``data.shares`` names; empty where nothing names them.
     """
 
     offsets: Tensor
     lengths: Tensor
     lowest_head_height: Tensor
+    groups: tuple[str, ...] = ()
 
     def following(self) -> Tensor:
         """``[F]`` int64, the frame after each frame; of a take's last frame, itself."""

@@ -12,6 +12,7 @@ from torch import Tensor
 from egopose.core.config import from_mapping
 from egopose.core.errors import InputError
 from egopose.data.fragments import FragmentLike
+from egopose.envs.start_shares import StartShares
 
 
 class Piece(NamedTuple):
@@ -119,21 +120,42 @@ def _bounds(fragments: Sequence[FragmentLike], offsets: Tensor, lengths: Tensor)
     return take, offsets[take] + local[:, 0], offsets[take] + local[:, 1]
 
 
+def _mean_frames(first: Tensor, choices: Tensor, stop: Tensor, horizon: int) -> Tensor:
+    """``[N]`` frames an episode has on average that starts at any of ``choices`` frames from ``first`` on."""
+    whole = (stop - horizon - first + 1).clamp_min(0).minimum(choices)
+    cut = choices - whole
+    # Those that the fragment's end cuts short have stop - (first + whole), one less, and so on: a sum of integers.
+    longest = stop - first - whole
+    return (whole * horizon + cut * longest - cut * (cut - 1) // 2).double() / choices
+
+
+def _drawn(bounds: Tensor, uniform: Tensor) -> Tensor:
+    """Which of the places with cumulative weights ``bounds [N]`` numbers in [0, 1) fall on."""
+    return torch.searchsorted(bounds, uniform * bounds[-1], right=True).clamp_max(len(bounds) - 1)
+
+
 class UniformStarts(Unlearning):
-    """All frames that leave enough room are equally likely starts.
+    """All frames that leave enough room are equally likely starts, except for groups of takes with a limit.
 
     Args:
         fragments: where episodes may lie.
         offsets, lengths: ``[K]`` of the takes.
         horizon: most frames of an episode, the first included (200 in the paper).
         minimum: frames an episode should have at least; fragments shorter than that start at their first frame.
+        shares: limits on what groups of takes may have of the frames that episodes see, if none falls; None for none.
 
     Raises:
         ValueError: no fragments, one outside its take, or a horizon or minimum that leave no step.
     """
 
     def __init__(
-        self, fragments: Sequence[FragmentLike], offsets: Tensor, lengths: Tensor, horizon: int, minimum: int
+        self,
+        fragments: Sequence[FragmentLike],
+        offsets: Tensor,
+        lengths: Tensor,
+        horizon: int,
+        minimum: int,
+        shares: StartShares | None = None,
     ) -> None:
         if not 2 <= minimum <= horizon:
             raise ValueError(f"2 <= minimum <= horizon must hold, got minimum {minimum}, horizon {horizon}")
@@ -142,10 +164,21 @@ class UniformStarts(Unlearning):
         self._ends = self._choices.cumsum(0)
         self._shift = self._start - (self._ends - self._choices)
         self.horizon = horizon
+        self._shares = shares
+        self._bounds = None
+        if shares is not None:
+            frames = _mean_frames(self._start, self._choices, self._stop, horizon)
+            self._bounds = shares(self._choices, self._take, frames).cumsum(0)
 
     def __call__(self, worlds: Tensor, generator: torch.Generator) -> Episodes:
-        pick = torch.randint(int(self._ends[-1]), worlds.shape, generator=generator)
-        fragment = torch.searchsorted(self._ends, pick, right=True)
+        if self._bounds is None:
+            pick = torch.randint(int(self._ends[-1]), worlds.shape, generator=generator)
+            fragment = torch.searchsorted(self._ends, pick, right=True)
+        else:
+            draw = torch.rand(2, len(worlds), dtype=torch.float64, generator=generator)
+            fragment = _drawn(self._bounds, draw[0])
+            choices = self._choices[fragment]
+            pick = self._ends[fragment] - choices + (draw[1] * choices).long()
         start = pick + self._shift.index_select(0, fragment)
         stop = torch.minimum(start + self.horizon, self._stop.index_select(0, fragment))
         return Episodes(self._take.index_select(0, fragment), start, stop)
@@ -159,7 +192,7 @@ class AdaptiveStarts(UniformStarts):
     uniform, so that no start vanishes. Before the first episodes all starts are uniform.
 
     Args:
-        fragments, offsets, lengths, horizon, minimum: see :class:`UniformStarts`.
+        fragments, offsets, lengths, horizon, minimum, shares: see :class:`UniformStarts`.
         settings: see :class:`AdaptiveStartSettings`.
     """
 
@@ -171,8 +204,9 @@ class AdaptiveStarts(UniformStarts):
         horizon: int,
         minimum: int,
         settings: AdaptiveStartSettings,
+        shares: StartShares | None = None,
     ) -> None:
-        super().__init__(fragments, offsets, lengths, horizon, minimum)
+        super().__init__(fragments, offsets, lengths, horizon, minimum, shares)
         self.settings = settings
         order = self._start.argsort()
         bins = [
@@ -184,6 +218,7 @@ class AdaptiveStarts(UniformStarts):
         ]
         self._first, ends, self._fragment = torch.tensor(bins).T.contiguous().unbind()
         self._size = ends - self._first
+        self._frames = _mean_frames(self._first, self._size, self._stop[self._fragment], horizon)
         #: ``[B]`` frames survived from each bin, the running estimate; a whole horizon where nothing fell.
         self.survived = torch.zeros(len(bins), dtype=torch.float64)
 
@@ -192,12 +227,15 @@ class AdaptiveStarts(UniformStarts):
         """``[B]`` of each bin, summing to one."""
         uniform = self._size / self._size.sum()
         urgent = self._size / (self.survived / self.settings.unit + 1)
-        return self.settings.floor * uniform + (1 - self.settings.floor) * urgent / urgent.sum()
+        drawn = self.settings.floor * uniform + (1 - self.settings.floor) * urgent / urgent.sum()
+        if self._shares is None:
+            return drawn
+        drawn = self._shares(drawn, self._take[self._fragment], self._frames)
+        return drawn / drawn.sum()
 
     def __call__(self, worlds: Tensor, generator: torch.Generator) -> Episodes:
-        bounds = self.probability.cumsum(0)
         pick = torch.rand(2, len(worlds), dtype=torch.float64, generator=generator)
-        drawn = torch.searchsorted(bounds, pick[0] * bounds[-1], right=True).clamp_max(len(bounds) - 1)
+        drawn = _drawn(self.probability.cumsum(0), pick[0])
         start = self._first[drawn] + (pick[1] * self._size[drawn]).long()
         fragment = self._fragment[drawn]
         return Episodes(self._take[fragment], start, torch.minimum(start + self.horizon, self._stop[fragment]))
@@ -242,12 +280,13 @@ def training_starts(
     lengths: Tensor,
     horizon: int,
     minimum: int,
+    shares: StartShares | None = None,
 ) -> UniformStarts:
     """The starts that ``task.starts`` asks for.
 
     Args:
         settings: ``{kind: uniform}``, or ``{kind: adaptive}`` and :class:`AdaptiveStartSettings`; None for uniform.
-        fragments, offsets, lengths, horizon, minimum: see :class:`UniformStarts`.
+        fragments, offsets, lengths, horizon, minimum, shares: see :class:`UniformStarts`.
 
     Raises:
         InputError: another kind, or a setting of it is wrong.
@@ -257,7 +296,7 @@ def training_starts(
     kind = values.pop("kind", None)
     if kind == "adaptive":
         adaptive = from_mapping(AdaptiveStartSettings, values, "task.starts")
-        return AdaptiveStarts(fragments, offsets, lengths, horizon, minimum, adaptive)
+        return AdaptiveStarts(fragments, offsets, lengths, horizon, minimum, adaptive, shares)
     if kind != "uniform" or values:
         raise InputError("task.starts", "kind", f"must be uniform, or adaptive with its settings, not {settings!r}")
-    return UniformStarts(fragments, offsets, lengths, horizon, minimum)
+    return UniformStarts(fragments, offsets, lengths, horizon, minimum, shares)

@@ -110,6 +110,7 @@ def take_table(takes: Sequence[TakeInfo]) -> TakeTable:
         torch.tensor([take.offset for take in takes]),
         torch.tensor([take.length for take in takes]),
         torch.tensor([take.lowest_head_height for take in takes], dtype=torch.float64),
+        tuple(take.group for take in takes),
     )
 
 

@@ -13,6 +13,7 @@ from egopose.data.fragments import FragmentLike
 from egopose.envs.imitation import ActionSettings, ImitationProblem, TerminationSettings
 from egopose.envs.mdp.rewards import build_reward
 from egopose.envs.problem import Problem
+from egopose.envs.start_shares import StartShares
 from egopose.envs.starts import Starts, WholeFragments, training_starts
 from egopose.envs.transforms import StateNormalizer, VisualContext
 from egopose.tasks.dataset import Dataset, smoothed
@@ -72,12 +73,14 @@ class ImitationTask:
     def starts(
         self, config: Mapping[str, Any], problem: Problem, fragments: Sequence[FragmentLike], whole_fragments: bool
     ) -> Starts:
-        """See :class:`~egopose.tasks.task.Task`; in training as ``task.starts`` says."""
+        """See :class:`~egopose.tasks.task.Task`; in training as ``task.starts`` and ``data.shares`` say."""
         task, takes = config["task"], problem.takes
         if whole_fragments:
             return WholeFragments(fragments, takes.offsets, takes.lengths)
         horizon, minimum = task["horizon"], task["minimum"]
-        return training_starts(task.get("starts"), fragments, takes.offsets, takes.lengths, horizon, minimum)
+        limits = config.get("data", {}).get("shares")
+        shares = StartShares(takes.groups, limits) if limits else None
+        return training_starts(task.get("starts"), fragments, takes.offsets, takes.lengths, horizon, minimum, shares)
 
 
 def training_deviation(states: torch.Tensor, dataset: Dataset, floor: float) -> torch.Tensor:
