@@ -14,7 +14,7 @@ def usage() -> str:
     """The help text."""
     width = max(map(len, VERBS))
     verbs = "\n".join(f"  {verb.ljust(width)}  {what}" for verb, what in VERBS.items())
-    more = 'egopose VERB --help says more of one; eval "$(egopose completion bash)" lets the shell complete them.'
+    more = '`egopose VERB --help` explains a verb; eval "$(egopose completion bash)" lets the shell complete them.'
     return f"usage: egopose VERB [key=value ...]\n       egopose --version\n\n{verbs}\n\n{more}"
 
 

@@ -1,14 +1,14 @@
 """``python -m egopose.bench VERB [--json] [--rounds N] [key=value ...]``: measure the program's own parts.
 
-env: the collection loop beside MuJoCo's own speed.
+env: the speed of the collection loop beside MuJoCo's own.
 features: from an MP4 to visual features beside decoding alone.
-rates: what coarser physics costs in tracking and energy, and what it saves.
+rates: tracking, energy and speed of coarser physics.
 scaling: the cost of every part of an iteration, and the memory of workers that share the data.
-sync: how well the offset between a motion and its video is found.
+sync: the accuracy of offsets between motions and videos.
 stream: live estimation: frames a second, latency by stage, late frames, memory.
-plan: looking ahead at test time beside the bare physics of it.
+plan: the planner at test time beside its bare physics.
 resume: a training killed at random moments beside the same one left alone.
-retarget: frames a second that are put onto the humanoid, on one core.
+retarget: frames a second of retargeting to the humanoid, on one core.
 export: what every export format loses, by independent readers.
 """
 

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import nbformat
 import pytest
+import yaml
 from nbclient import NotebookClient
 
 from egopose.__main__ import VERBS
@@ -159,6 +160,50 @@ def test_a_module_that_is_not_there_is_found() -> None:
     assert exists("egopose.motion.motion.Motion")
     assert not exists("egopose.motion.motion.Film")
     assert not exists("egopose.nowhere")
+
+
+def settings_of(verb: str) -> set[str]:
+    """Dotted settings of a verb's file and of all groups, with the mappings above them."""
+    paths = [(ROOT / "conf" / f"{verb}.yaml", "")]
+    paths += [(path, path.parent.name) for path in (ROOT / "conf").glob("*/*.yaml")]
+    out = {path.parent.name for path, _ in paths[1:]}
+    for path, group in paths:
+        text = path.read_text()
+        heads = [""] if "@package _global_" in text or not group else [f"{group}."]
+        heads += [f"data.{group}."] if group in ("camera", "reader") else []  # conf/data mounts these
+        todo = [(head, yaml.safe_load(text) or {}) for head in heads]
+        while todo:
+            head, values = todo.pop()
+            out |= {f"{head}{key}" for key in values}
+            todo += [(f"{head}{key}.", value) for key, value in values.items() if isinstance(value, dict)]
+    return out
+
+
+def unknown_settings(text: str) -> list[str]:
+    """``VERB key`` of the settings in a page's commands that the verb does not have."""
+    blocks = "\n".join(re.findall(r"```bash\n(.*?)```", text, re.DOTALL)).replace("\\\n", " ")
+    out = []
+    for verb, rest in re.findall(r"^(?:\w+=\S+ )*(?:egopose |python -m egopose\.)(\w+)(.*)$", blocks, re.MULTILINE):
+        name = "body_parts" if "--config-name body_parts" in rest else verb
+        if not (ROOT / "conf" / f"{name}.yaml").is_file():
+            continue
+        words = re.sub(r"'[^']*'|\"[^\"]*\"", lambda m: m[0].strip("'\"").replace(" ", ""), rest.partition(" #")[0])
+        keys = [
+            key for key in re.findall(r"(?<=\s)([a-z_][\w.]*)=", words) if not key.startswith(("hydra.", "options."))
+        ]
+        # `to` of export stands in no file.
+        out += [f"{verb} {key}" for key in keys if key not in settings_of(name) | {"to"}]
+    return out
+
+
+@pytest.mark.parametrize("path", PAGES, ids=lambda p: p.name)
+def test_settings_in_the_commands_of_the_docs_are_there(path: Path) -> None:
+    assert unknown_settings(path.read_text()) == []
+
+
+def test_a_setting_that_is_not_there_is_found() -> None:
+    page = "```bash\negopose train collector.worlds=3 seed=1  # x=1\nA=b egopose evaluate planner.knot=2 out=x\n```"
+    assert unknown_settings(page) == ["train collector.worlds", "evaluate planner.knot"]
 
 
 @pytest.mark.parametrize("path", PAGES, ids=lambda p: p.name)

@@ -365,7 +365,7 @@ def test_a_stream_is_shown_live() -> None:
     try:
         pose = LivePose(frame=7, qpos=motion.qpos[7], value=1.0, confidence=None, reset=False)
         wait_until(lambda: viewer.frame == 7, "the pose is shown", lambda: sent.send(frame_json(pose, 30.0, 5.0)))
-        assert not any(ghost.visible for ghost in viewer._ghosts)
+        assert not any(shape.visible for shape in viewer._poses_ahead)
         # A forecast begun two frames earlier: its poses ahead of the one shown, as far as it reaches.
         turning = np.tile(motion.qpos[7], (40, 1))
         turning[:, 7] += 0.01 * np.arange(40)
@@ -381,7 +381,7 @@ def test_a_stream_is_shown_live() -> None:
 
         wait_until(lambda: viewer.forecast >= 5 and viewer._angle._lines, "the forecast is shown", send)
         assert viewer.forecast == 5
-        assert [ghost.visible for ghost in viewer._ghosts] == [True, True, False, False]
+        assert [shape.visible for shape in viewer._poses_ahead] == [True, True, False, False]
         high, low, middle = viewer._angle._lines
         np.testing.assert_allclose(middle, turning[:, 7], atol=1e-4)
         np.testing.assert_allclose(high - low, 0.3, atol=1e-3)
@@ -391,7 +391,7 @@ def test_a_stream_is_shown_live() -> None:
         posed = forward_kinematics(motion.skeleton, turning[row][None])
         root = motion.qpos[7, :3] * [1, 1, 0]  # the body shown stands before the camera
         expected = viewer._surface.posed(posed[0][0] - root, posed[1][0])
-        np.testing.assert_allclose(viewer._ghosts[0].vertices, expected, atol=1e-3)
+        np.testing.assert_allclose(viewer._poses_ahead[0].vertices, expected, atol=1e-3)
     finally:
         viewer.close()
         sent.close()

@@ -149,7 +149,7 @@ def explained(name: str, error: HydraException) -> InputError:
 
 
 def check_arguments(arguments: Sequence[str]) -> None:
-    """To be called before Hydra's main sees a command line that may bring a stranger's configuration with it.
+    """To be called before Hydra's main reads a command line that may bring an untrusted configuration.
 
     Raises:
         InputError: ``--config-dir``, ``--config-path`` or a ``file://`` search path holds configuration that names

@@ -1,4 +1,4 @@
-"""Reading what may come from strangers: JSON, YAML and folders of tensors that can run nothing and stay small.
+"""Safe readers of untrusted files: JSON, YAML and folders of tensors cannot run code and stay small.
 
 A folder of memory-mapped tensors is more than tensors: its ``meta.json`` names the class to build, and what TensorDict
 cannot map it reads from a pickle beside it. Here a folder is looked through first and all but plain tensors refused.
@@ -126,7 +126,7 @@ _MAX_ENCODER_WEIGHTS = 2**28
 
 
 def check_sizes(config: Any, source: Path) -> None:
-    """A stranger's configuration must not ask for networks that fill the memory before their weights are looked at.
+    """An untrusted configuration must not ask for networks that fill the memory before their weights are read.
 
     Raises:
         InputError: a width, a number of layers, a picture or a pool of workers beyond any use; names the key.

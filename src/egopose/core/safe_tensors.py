@@ -1,4 +1,4 @@
-"""Reading what may come from strangers: JSON, YAML and folders of tensors that can run nothing and stay small.
+"""Safe readers of untrusted folders of tensors: they cannot run code and stay small.
 
 A folder of memory-mapped tensors is more than tensors: its ``meta.json`` names the class to build, and what TensorDict
 cannot map it reads from a pickle beside it. Here a folder is looked through first and all but plain tensors refused.

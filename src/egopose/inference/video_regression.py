@@ -82,7 +82,7 @@ def seen_in(
 def seen_live(
     causal: CausalRegression, regressor: StateRegressor, flow: np.ndarray, source_config: Mapping[str, Any]
 ) -> dict[str, Tensor]:
-    """As :func:`seen_in`, each frame as it would have been seen live; smoothed where the policy follows that."""
+    """As :func:`seen_in`, but each frame as in the live stream; smoothed if the policy follows smoothed states."""
     encoder, batch = regressor.encoder, int(source_config["vision"]["encode_batch"])
     features = encode(encoder, flow, batch)  # type: ignore[arg-type]  # a regressor of video has a FlowEncoder
     result = [causal.push(frame, row) for frame, row in enumerate(features)]

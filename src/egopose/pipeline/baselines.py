@@ -98,7 +98,7 @@ def run_baseline(
 
 
 def run_baseline_job(config: dict[str, Any], folder: Path) -> None:
-    """Train in ``folder`` as far as that is still to be done: from its last checkpoint, or not at all.
+    """Train the rest of ``folder``, from its last checkpoint; a finished one is left as it is.
 
     Raises:
         InputError: as :func:`run_baseline`; the directory is that of another job.
@@ -171,7 +171,7 @@ def _own_settings(values: Mapping[str, Any]) -> dict[str, Any]:
 
 def _learner(config: Mapping[str, Any], dataset: Dataset, settings: FitSettings) -> RecurrentLearner | PathPoseLearner:
     store = TakeStore.open(store_folder(config))
-    # Kinematics need no floor to stand on: every training frame may be learned from, as by the state regressor.
+    # Kinematic methods need no floor: they may learn from every training frame, as the state regressor does.
     pieces = split_takes(store.takes, config["data"]["split"], "train", supported_only=False)
     spans = [Span(*span) for span in global_spans(store, pieces)]
     states = humanoid_state(dataset.reference).float()

@@ -1,4 +1,4 @@
-"""What a policy is trained on and judged by: everything that comes from data, none of it learned by PPO."""
+"""From a configuration to the data a policy is trained and judged on; nothing in it is learned by PPO."""
 
 from __future__ import annotations
 
@@ -21,7 +21,8 @@ from egopose.tasks.task import task_of
 
 @dataclass(frozen=True)
 class PreparedData:
-    """What a task can make its dataset of: a configuration's own data. See :class:`egopose.tasks.task.Sources`.
+    """The data from which a task can make its dataset: those of a configuration. See
+    :class:`egopose.tasks.task.Sources`.
 
     Args:
         config: resolved. Its data is prepared where that has not been done yet.
@@ -63,7 +64,7 @@ def load_dataset(config: Mapping[str, Any], progress: bool = True) -> Dataset:
 
 
 def run_dataset(config: Mapping[str, Any], run: Path, same_store: bool = True, progress: bool = True) -> Dataset:
-    """The dataset of a trained run, seen by the run's own state regressor ``run/regressor``; nothing is trained.
+    """The dataset of a trained run, with the run's own state regressor ``run/regressor``; nothing is trained.
 
     Args:
         config: the run's, resolved. Its data is prepared where that has not been done yet.
@@ -75,7 +76,7 @@ def run_dataset(config: Mapping[str, Any], run: Path, same_store: bool = True, p
         InputError: as :func:`load_dataset`; the data is not the run's, or neither run nor store holds a regressor.
     """
     if same_store:
-        # Before anything is prepared: hours could pass, only to be refused.
+        # Checked before anything is prepared, since preparing can take hours.
         require_same_store(run, fingerprint_of(config))
     return task_of(config).dataset(config, PreparedData(config, run, progress))
 

@@ -1,8 +1,8 @@
 """The state regressor F of a store: trained once for a configuration, its predictions kept as a table of the store.
 
-Two places hold what came of it: ``STORE/tables/NAME`` (predictions on every frame) and ``STORE/regressors/NAME`` (the
+Two places hold the result: ``STORE/tables/NAME`` (predictions on every frame) and ``STORE/regressors/NAME`` (the
 weights, in the checkpoint format), NAME being a fingerprint of all that F depends on. While F is being trained,
-``STORE/regressors/NAME.part`` holds what it takes to go on after an interruption.
+``STORE/regressors/NAME.part`` holds the state to resume from after an interruption.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ def regressor_name(config: Mapping[str, Any], store: TakeStore, flow_name: str) 
 def regressor_tables(
     config: Mapping[str, Any], store: TakeStore, humanoid: HumanoidModel, flow_name: str
 ) -> tuple[TensorDict, Path]:
-    """F's predictions for every frame of the store; F is trained where that has not been done.
+    """F's predictions for every frame of the store; F is trained if it has not been yet.
 
     Returns:
         TensorDict ``[F]`` with ``humanoid_state [S]`` (z in its own units), ``visual_context [C]``,
@@ -91,16 +91,16 @@ def regressor_tables(
 def kept_tables(
     config: Mapping[str, Any], store: TakeStore, humanoid: HumanoidModel, flow_name: str, weights: Path
 ) -> tuple[TensorDict, Path]:
-    """As :func:`regressor_tables`, by the F a run was trained with: nothing is ever learned here.
+    """As :func:`regressor_tables`, with the F that a run was trained with; nothing is trained.
 
-    A table of the store made by the very same weights is read; else F predicts anew, and the store is left as it is.
+    If the store has a table made by the same weights, it is read. Else F predicts again, and the store is not changed.
 
     Args:
         config: of the run, resolved.
         store: with flow.
         humanoid: of the run.
         flow_name: the flow's name in the store.
-        weights: ``RUN_DIR/regressor``. Where there is none, the store's F for ``config`` is taken.
+        weights: ``RUN_DIR/regressor``. If there is none, the store's F for ``config`` is taken.
 
     Raises:
         InputError: neither the run nor the store holds an F, its weights are damaged, or the store lacks flow.
@@ -137,7 +137,7 @@ def _network_config(config: Mapping[str, Any]) -> dict[str, Any] | None:
 
 
 def _by_subject(config: Mapping[str, Any]) -> bool:
-    """Where people are held out for testing, they are for cross-fitting: whom F knows it knows far better."""
+    """If people are held out for testing, cross-fitting holds out people too: F does far better on people it knows."""
     return config["data"]["split"]["kind"] == "subject" and int(config["regressor"]["cross_fit"]) > 1
 
 
@@ -226,7 +226,7 @@ def _keep(
     sizes: dict[str, Any],
     card: dict[str, Any],
 ) -> None:
-    """Weights and table. Never weights beside a table that others made."""
+    """Weights and table together, never weights beside a table that others made."""
     shutil.rmtree(store.root / "tables" / name, ignore_errors=True)
     RunCheckpoint({"regressor": model, "config": sizes}).save(
         store.root / "regressors" / name,
@@ -245,7 +245,7 @@ def _training_spans(config: Mapping[str, Any], store: TakeStore) -> list[Span]:
 
 
 def _blocks(config: Mapping[str, Any], store: TakeStore) -> list[list[Span]]:
-    """The training frames in as many lists as there are cross-fits."""
+    """The training frames, divided into one list a cross-fit."""
     folds = _settings(config).cross_fit
     pieces = split_takes(store.takes, config["data"]["split"], "train", supported_only=False)
     fragments = _training_spans(config, store)
@@ -348,7 +348,8 @@ def _save_part(part: Path, state: State) -> None:
 
 
 def _load_part(part: Path) -> State | None:
-    """What :func:`_save_part` left, None where training starts anew. Raises InputError where it is damaged."""
+    """The state that :func:`_save_part` left; None if training starts from the beginning. Raises InputError: it is
+    damaged."""
     if not part.is_dir():
         return None
     state: State = {}
@@ -384,7 +385,7 @@ def load_regressor(weights: str | Path) -> tuple[StateRegressor, dict[str, Any]]
     size = int(config["state_size"])
     encoder = build_encoder(config["vision"]["encoder"])
     settings = _settings(config)
-    # The statistics come with the weights; two frames of zeros stand in for the frames they were taken from.
+    # The statistics come with the weights; two frames of zeros replace the frames they were computed from.
     model = build_regressor(encoder, torch.zeros(2, size), [Span(0, 2)], settings, encoder.features)
     if _network_config(config) is not None:
         kernel = _kernel_settings(config)

@@ -59,7 +59,7 @@ class ForecastThread:
         self._thread.start()
 
     def see(self, frame: int, flow: NDArray[np.float32]) -> None:
-        """Remember the flow ``[2, S, S]`` of a control frame. Where frames are missing the past begins anew."""
+        """Remember the flow ``[2, S, S]`` of a control frame. If frames are missing, the past starts again."""
         if self._flow and self._flow[-1][0] != frame - 1:
             self._flow.clear()
         self._flow.append((frame, flow))

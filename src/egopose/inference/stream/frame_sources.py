@@ -199,7 +199,7 @@ def _file_frames(settings: SourceSettings) -> Iterator[tuple[float, Frame]]:
 
 
 def _capture_live(settings: SourceSettings, into: NewestFrame, stop: threading.Event) -> None:
-    """Pictures until the source ends; one that breaks off is opened anew, see :class:`ReconnectSettings`."""
+    """Pictures until the source ends; a source that breaks off is opened again, see :class:`ReconnectSettings`."""
     rule, seen = settings.reconnect, False
     wait, broken_since = rule.first, time.perf_counter()
     while not stop.is_set():
@@ -227,7 +227,7 @@ def _read_live(settings: SourceSettings, into: NewestFrame, stop: threading.Even
     try:
         if not opened.isOpened():
             return False
-        # An address that tells how many frames it has is a file; it ends and is not asked for again.
+        # An address that announces its number of frames is a file: it ends and is not opened again.
         finite = not settings.is_camera and opened.get(cv2.CAP_PROP_FRAME_COUNT) > 0
         announced = opened.get(cv2.CAP_PROP_FPS)
         times = PictureTimes(settings.fps or (announced if _RATES[0] <= announced <= _RATES[1] else None))

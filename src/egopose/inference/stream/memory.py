@@ -1,4 +1,4 @@
-"""How a process's memory goes over time, in memory of a fixed size."""
+"""The memory of a process over time, recorded in a fixed size."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _KEPT = 512
 
 
 class MemoryTrace:
-    """Resident memory against time. Only Linux tells it (elsewhere all is None)."""
+    """Resident memory against time. It is known on Linux only; elsewhere all values are None."""
 
     def __init__(self) -> None:
         self._samples: list[tuple[float, float]] = []
