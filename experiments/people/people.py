@@ -27,6 +27,8 @@ egopose prepare data=tennis data.folder=PATH stages=motion
 python experiments/people/people.py STORE STORE     # the folders that these name in their last lines
 ```
 
+cmu_people was prepared in two goes: all of it, and once more the people cmu94 and cmu135
+(`+data.where.person=[cmu94,cmu135]`), whose files were refused before positions in the world's axes could be read.
 `data=people` has the takes of both. PATH holds the table `clips.csv` and what the sets' archives unpack to. Minutes
 that train or test lie on the floor, in pieces of a second and more. *Feasible* frames are those that contact with the
 floor can have made. CMU: free for research and commercial use. Tennis: CC BY-SA 3.0, no weights trained on it are
@@ -45,6 +47,14 @@ def raw_of(store: TakeStore) -> dict[str, Any]:
     people = minutes_by_person(store, compose_config("prepare", [f"data={name}"])["data"]["split"])
     left_out = [vars(clip) for clip in store.left_out]
     return {"set": name, "fps": store.fps, "takes": takes, "people": people, "left_out": left_out}
+
+
+def joined(first: dict[str, Any], second: dict[str, Any]) -> dict[str, Any]:
+    """Two stores of one set: a clip that either has is not refused, one that both leave out counts once."""
+    takes = {take["name"]: take for take in (*first["takes"], *second["takes"])}
+    left_out = {clip["name"]: clip for clip in (*first["left_out"], *second["left_out"]) if clip["name"] not in takes}
+    people = {**first["people"], **second["people"]}
+    return {**first, "takes": list(takes.values()), "people": people, "left_out": list(left_out.values())}
 
 
 def page(raws: list[dict[str, Any]]) -> str:
@@ -119,9 +129,12 @@ def _told(notes: list[str]) -> list[str]:
 
 def main() -> None:
     """Command line."""
+    sets: dict[str, dict[str, Any]] = {}
     for folder in sys.argv[1:]:
         raw = raw_of(TakeStore.open(folder))
-        (HERE / "raw" / f"{raw['set']}.json").write_text(json.dumps(raw, indent=1) + "\n")
+        sets[raw["set"]] = joined(sets[raw["set"]], raw) if raw["set"] in sets else raw
+    for name, raw in sets.items():
+        (HERE / "raw" / f"{name}.json").write_text(json.dumps(raw, indent=1) + "\n")
     raws = [json.loads(path.read_text()) for path in sorted((HERE / "raw").glob("*.json"))]
     (HERE / "README.md").write_text(page(raws))
 

@@ -124,6 +124,47 @@ def test_positions_are_added_or_replace(
     assert any("added to OFFSET" in note for note in notes_of(motion)) == added
 
 
+@pytest.mark.parametrize("joints", ["all", "two"])
+def test_positions_may_be_places_in_the_world(joints: str, squat: Bvh, expected: Motion, tmp_path: Path) -> None:
+    """As some exporters of CMU's mocap write them, for the trunk and the head alone."""
+    places = (
+        rot.rotate(rot.conjugate(up_rotation("y")), expected.forward_kinematics()[0]) / expected.meta["unit_metres"]
+    )
+    six = squat.with_six_channels(np.copy)
+    rows = six.rows.copy()
+    for i in range(1, places.shape[1]):
+        rows[:, 6 * i : 6 * i + 3] = places[:, i]
+    six = replace(six, rows=rows)
+    if joints == "two":  # the root's first child and its first child keep their places, all others only turn
+        kept = [k for i in range(places.shape[1]) for k in range(6 * i, 6 * i + 6) if i < 3 or k % 6 > 2]
+        parts = six.hierarchy.split("CHANNELS 6 Xposition Yposition Zposition ")
+        hierarchy = "".join(
+            part if not i else f"CHANNELS {'6 Xposition Yposition Zposition' if i < 4 else '3'} {part}"
+            for i, part in enumerate(parts)
+        )
+        six = Bvh(hierarchy, six.frame_time, rows[:, kept])
+    motion = read_text(tmp_path, six.text(decimals=8))
+    assert_same(motion, expected)
+    assert any("places in the world" in note for note in notes_of(motion))
+
+
+def test_the_place_of_the_body_on_a_carrier_is_none_in_the_world(squat: Bvh, expected: Motion, tmp_path: Path) -> None:
+    """Hips that sway by less than their height stay about as far from the carrier's origin as their OFFSET is long."""
+    root = squat.rows[:, :3]
+    offset = " ".join(f"{v:.5f}" for v in root.mean(axis=0))
+    body = re.sub(r"ROOT (\w+)\s*\{\s*OFFSET .*", rf"JOINT \1\n{{\nOFFSET {offset}", squat.hierarchy.split("\n", 1)[1])
+    channels = "CHANNELS 6 Xposition Yposition Zposition Zrotation Xrotation Yrotation"
+    hierarchy = f"HIERARCHY\nROOT Carrier\n{{\nOFFSET 0 0 0\n{channels}\n{body}}}\n"
+    turned = np.tile([0.0, 0.0, 0.0, 0.0, 0.0, 90.0], (len(root), 1))
+    rows = np.concatenate([turned, squat.rows], axis=1)
+    rows[:, 6:9] = root.mean(axis=0)
+    rows[:, 6] += np.linspace(-8.0, 8.0, len(rows))
+    motion = read_text(tmp_path, Bvh(hierarchy, squat.frame_time, rows).text(decimals=8))
+    assert not any("places in the world" in note for note in notes_of(motion))
+    hips = motion.forward_kinematics()[0][:, motion.skeleton.names.index(expected.skeleton.names[0])]
+    np.testing.assert_allclose(sorted(np.ptp(hips, axis=0)), [0.0, 0.0, 0.16], atol=1e-4)  # the sway and no more
+
+
 def test_positions_alone_make_the_bones_where_offsets_are_nought(squat: Bvh, expected: Motion, tmp_path: Path) -> None:
     six = squat.with_six_channels(np.copy)
     bare = re.sub(r"OFFSET .*(\n\s*CHANNELS)", r"OFFSET 0 0 0\1", six.hierarchy)

@@ -124,6 +124,6 @@ def test_the_report_of_a_store_says_the_warnings() -> None:
     take = TakeInfo("a", "1", 0, 9, 1.4, "a.bvh", "v.mp4", 0.0, True, ((0, 9),), 1.0, warnings=("odd; set this",))
 
     class Store:
-        takes, fps, frames_total, root = (take,), 30.0, 9, "store"
+        takes, fps, frames_total, root, left_out = (take,), 30.0, 9, "store", ()
 
     assert "warning: a: odd; set this" in store_report(Store())  # type: ignore[arg-type]

@@ -2,14 +2,15 @@
 
 A joint's rotation channels become hinges in the file's order; of equal triples of angles the continuous ones are taken.
 Position channels replace the joint's OFFSET, as most exporters mean them, or are added to it, as the values say; where
-they stay constant they become the offset, else slides before the hinges.
+they stay constant they become the offset, else slides before the hinges. Some files give the places of joints in the
+world there, as the values say too: they are turned into the parent's axes.
 """
 
 from __future__ import annotations
 
 import itertools
 from collections import Counter
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -126,8 +127,10 @@ class _LocalPose:
 
 
 def _local_poses(raw: BvhFile, notes: list[str]) -> list[_LocalPose]:
-    poses, columns, added = [], _columns(raw.joints), _added_to_offset(raw)
-    if any(added):
+    poses, columns, added, in_world = [], _columns(raw.joints), _added_to_offset(raw), _places_in_the_world(raw)
+    if in_world:
+        notes.append("positions of joints below the root are places in the world, as their values say")
+    elif any(added):
         notes.append("positions of joints below the root are added to OFFSET, as their values say")
     for joint, column, adds in zip(raw.joints, columns, added, strict=True):
         channels = joint.channels or ()
@@ -143,7 +146,27 @@ def _local_poses(raw: BvhFile, notes: list[str]) -> list[_LocalPose]:
         angles = np.deg2rad(values[:, turning])
         angles = continuous_euler(angles) if len(set(axes)) == 3 else np.unwrap(angles, axis=0)
         poses.append(_LocalPose(translation, len(turning) < len(channels), axes, angles))
-    return poses
+    return _in_parents(raw.joints, poses) if in_world else poses
+
+
+def _in_parents(joints: list[BvhJoint], poses: list[_LocalPose]) -> list[_LocalPose]:
+    """The poses with driven joints' translations, which are places in the world, turned into their parents' axes."""
+    out: list[_LocalPose] = []
+    places: list[Array] = []
+    turns: list[Array] = []
+    for joint, pose in zip(joints, poses, strict=True):
+        place, turn = pose.translation, pose.quat()
+        if joint.parent >= 0:
+            parent, axes = places[joint.parent], turns[joint.parent]
+            if pose.driven:
+                pose = replace(pose, translation=rot.rotate(rot.conjugate(axes), place - parent))
+            else:
+                place = parent + rot.rotate(axes, place)
+            turn = rot.multiply(axes, turn)
+        out.append(pose)
+        places.append(place)
+        turns.append(turn)
+    return out
 
 
 def _columns(joints: list[BvhJoint]) -> list[int]:
@@ -169,6 +192,31 @@ def _added_to_offset(raw: BvhFile) -> list[bool]:
     added, replaced = misfits[body + 1 :].sum(axis=0)
     own = misfits[:, 0] < misfits[:, 1]
     return [bool(added < _CLEARLY * replaced and (i > body or own[i])) for i in range(len(raw.joints))]
+
+
+def _places_in_the_world(raw: BvhFile) -> bool:
+    """Whether the position channels below the root say where joints are in the world, rather than in their parents.
+
+    Then a joint keeps an OFFSET's length from where its parent is. Joints vote whose parents' places are known too, but
+    for the body's first joint and those above it: their place is in the world anyway.
+    """
+    places: dict[int, Array] = {}
+    for i, (joint, column) in enumerate(zip(raw.joints, _columns(raw.joints), strict=True)):
+        at = {c[0]: column + k for k, c in enumerate(joint.channels or ()) if c.endswith("position")}
+        if set(at) == set("xyz"):
+            places[i] = raw.values[:, [at[axis] for axis in "xyz"]]
+    misfits, body = np.zeros(3), _first_branching(raw.joints)  # were they in the world, added, replacing
+    for i, place in places.items():
+        joint = raw.joints[i]
+        if i <= body or joint.parent not in places:
+            continue
+        offset = np.array(joint.offset)
+        length = float(np.linalg.norm(offset))
+        found = (place - places[joint.parent], place, place - offset)
+        wanted = (length, 0.0, 0.0)
+        for k in range(3):
+            misfits[k] += np.percentile(np.abs(np.linalg.norm(found[k], axis=1) - wanted[k]), 90)
+    return bool(misfits[0] < _CLEARLY * misfits[1:].min())
 
 
 def _first_branching(joints: list[BvhJoint]) -> int:
