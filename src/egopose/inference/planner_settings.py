@@ -77,7 +77,7 @@ class PlannerSettings:
             table = build_reward(self.reward)
         except ValueError as error:
             raise InputError("planner", "reward", str(error)) from None
-        # What is followed knows no place in the world, and a plan is judged by nothing but the body.
+        # The target motion has no place in the world, and a plan is judged by the body alone.
         check(not table.in_world and not table.needs, "reward", "must be of the body alone, in the heading frame")
 
 
