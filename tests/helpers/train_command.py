@@ -18,10 +18,10 @@ TESTS = Path(__file__).parents[1]
 
 # The command, on the toy problem: `pipeline` is replaced by one that builds it.
 LAUNCHER = """
-import sys, types
+import sys
 sys.path.insert(0, {tests!r})
 from helpers.toy_problem import make_run
-stand_in = types.ModuleType("egopose.pipeline")
+from egopose.pipeline import training
 from egopose.training.loop import interrupts_held
 def build_run(config, folder, dataset):
     with interrupts_held():
@@ -29,13 +29,10 @@ def build_run(config, folder, dataset):
                         checkpoint_every=config["training"]["checkpoint_every"],
                         max_seconds=config["training"]["max_seconds"],
                         collector={{name: config["collector"][name] for name in ("kind", "workers")}})
-stand_in.build_run = build_run
-stand_in.load_dataset = lambda config: None
-stand_in.run_dataset = lambda config, folder: None
-stand_in.build_evaluation = lambda run, dataset: None
-sys.modules["egopose.pipeline"] = stand_in
-import egopose
-egopose.pipeline = stand_in
+training.build_run = build_run
+training.load_dataset = lambda config: None
+training.run_dataset = lambda config, folder: None
+training.build_evaluation = lambda run, dataset: None
 from egopose.train import main
 if __name__ == "__main__":
     main()

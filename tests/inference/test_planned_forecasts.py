@@ -23,6 +23,7 @@ from egopose.core.torch_settings import torch_threads
 from egopose.data.windows import ForecastWindow
 from egopose.envs.imitation import followed_forecasts
 from egopose.envs.mdp.observations import humanoid_state
+from egopose.envs.mdp.step_view import StepView
 from egopose.envs.reference_forecasts import ReferenceForecasts
 from egopose.envs.test_time import prepare_for_test
 from egopose.evaluation import forecast_run as forecast_evaluation
@@ -56,7 +57,7 @@ def dataset() -> Dataset:
     made = Dataset(humanoid, reference, takes, PIECES, PIECES, states=humanoid_state(reference).float())
     known = curves(made)
     coefficients = 2 * known.coefficients[:, :1] - known.coefficients
-    return replace(made, futures=ReferenceForecasts(coefficients, known.starts, known.frames, known.horizon, 3, FPS))
+    return replace(made, forecasts=ReferenceForecasts(coefficients, known.starts, known.frames, known.horizon, 3, FPS))
 
 
 @pytest.fixture(scope="module")
@@ -125,9 +126,9 @@ def test_the_body_that_is_followed_is_the_curves_at_that_step(agent: Agent) -> N
     planner = planner_for(agent, WINDOWS, every=4)
     reward, seen = planner._reward, list[tuple[SimpleNamespace, Tensor]]()
 
-    def spied(body: Any, followed: SimpleNamespace, step: Tensor) -> Any:
-        seen.append((followed, step))
-        return reward(body, followed, step)
+    def spied(view: StepView) -> Any:
+        seen.append((view.reference, view.step))
+        return reward(view)
 
     planner._reward = spied
     forecast_of(agent, WINDOWS, planner=planner)
@@ -245,7 +246,7 @@ def test_each_lot_of_windows_has_a_planner_that_follows_its_curves(agent: Agent,
     assert [one.closed for one in made] == [True, True]
     now = nows(agent, WINDOWS)
     for one, part in zip(made, (now[:2], now[2:]), strict=True):
-        env, actor, critic, states, used, row = one.given
+        env, actor, critic, used, (states, row) = one.given
         assert (actor, critic, used) == (agent.actor, agent.critic, chosen)
         assert env.batch_size == torch.Size([12 * len(part)])
         steps = torch.arange(13).repeat(len(part))

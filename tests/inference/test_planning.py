@@ -521,7 +521,9 @@ def estimated_by(planner: PlannerSettings | None, made: Callable[[], None] = lam
         made()
         assert options == {"whole_fragments": True, "falls_end": False}
         assert list(fragments) == list(PIECES)
-        return frozen(make_env(num_envs, threads=threads))
+        env = frozen(make_env(num_envs, threads=threads))
+        env.base_env.problem.states = states
+        return env
 
     states = states_of(other_motion())
     agent: Any = SimpleNamespace(

@@ -123,7 +123,7 @@ def test_privileged_critic_reads_the_reference_and_the_actor_does_not() -> None:
         ({"sigma": 0.0}, "sigma"),
         ({"activation": "softplus"}, "activation"),
         ({"depth": 3}, "depth"),
-        ({"context": {"source": "none", "hidden_size": 1, "horizon": 1, "padding": 1}}, "context.source"),
+        ({"context": {"source": "seen", "hidden_size": 1, "horizon": 1, "padding": 1}}, "context.source"),
         ({"critic": {"hidden": [3]}}, "privileged"),
         ({"critic": {"hidden": [3], "privileged": ["wind"]}}, "critic.privileged"),
         ({"inputs": ["tracking_error", "wind"]}, "inputs"),

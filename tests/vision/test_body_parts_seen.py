@@ -16,12 +16,12 @@ from helpers.frame_by_frame import assert_frame_by_frame_as_the_video_up_to_ther
 from helpers.live_stand_in import run_config, untrained, write_walk
 from helpers.small_store import configuration, fill_flow
 
-from egopose.checkpoint import checkpoint
 from egopose.checkpoint.body_parts import load_body_part_estimator
 from egopose.core.config import compose_config, from_mapping
 from egopose.core.errors import InputError
 from egopose.data.preparation import flow_name, humanoid_of, prepare
 from egopose.data.store import TakeStore
+from egopose.inference.stream import build
 from egopose.inference.stream.build import load_forecaster
 from egopose.inference.stream.frame_features import FrameFeatures
 from egopose.models.blended import TimeWindows, blended_regressor, flow_cells, kernel_view
@@ -283,7 +283,7 @@ def test_a_regressor_sees_limbs_only_where_its_kernel_names_a_finder() -> None:
     assert from_mapping(KernelSettings, chosen["kernel"], "x").limb_numbers == 2 * finder.numbers
     assert not finder.training
     for name in ("none-such", "cmu6_estimation/..", ""):
-        with pytest.raises(InputError, match="no limb finder"):
+        with pytest.raises(InputError, match="no body-part estimator"):
             load_body_part_estimator(name)
 
 
@@ -307,9 +307,10 @@ def test_a_live_forecast_needs_the_limbs_of_the_estimating_run(monkeypatch: pyte
     run = run_config("fast", "residual")
     run["task"] = {**run["task"], "context": 30}
     run["model"] = {**run["model"], "context": {**run["model"]["context"], "source": "past"}}
-    monkeypatch.setattr(checkpoint, "find_checkpoint", lambda *_: Path("forecasts"))
-    monkeypatch.setattr(checkpoint, "read_json", lambda *_: run)
-    monkeypatch.setattr(regression, "load_regressor", lambda _: (trained.regressor, trained.source_config))
+    run["task"] = {**run["task"], "name": "forecasting"}
+    monkeypatch.setattr(build, "find_checkpoint", lambda *_: Path("forecasts"))
+    monkeypatch.setattr(build, "read_json", lambda *_: run)
+    monkeypatch.setattr(build, "load_regressor", lambda _: (trained.regressor, trained.source_config))
     chosen = compose_config("stream", ["source=none", "checkpoint=none", "forecast.checkpoint=forecasts"])
     seeing = {
         **trained.source_config,
@@ -347,7 +348,7 @@ def test_a_store_keeps_the_finders_rows_and_its_regressor_is_read_back(
 
     for module in (sight, blending):
         monkeypatch.setattr(module, "load_body_part_estimator", lambda _: finder)
-    monkeypatch.setattr("egopose.vision.features.extract_body_parts", rows_of)
+    monkeypatch.setattr("egopose.pipeline.regressor_input.extract_body_parts", rows_of)
     wanted = np.concatenate([store.flow(flow), as_plane(known.numpy(), 8)], axis=1)
     there = {path.name for path in (store.root / "tables").glob("*")}
     np.testing.assert_array_equal(seen_in_store(config, config["regressor"], store, flow)[:], wanted)
