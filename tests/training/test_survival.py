@@ -373,14 +373,26 @@ def test_resumed_from_another_directory_before_its_first_checkpoint(done: Path, 
     assert rows[0] == rows[1]
 
 
-#: joblib's processes know nothing of the program they work for: on their path, this brings them its stand-in.
+#: joblib's processes know nothing of the launcher: on their path, this runs it when they import what it changes.
 STAND_IN = """
+import runpy
 import sys
-from importlib.util import spec_from_file_location
+from importlib.machinery import PathFinder
 
 class Finder:
     def find_spec(self, name, path=None, target=None):
-        return spec_from_file_location(name, {launcher!r}) if name == "egopose.pipeline" else None
+        if name != "egopose.pipeline.training":
+            return None
+        sys.meta_path.remove(self)
+        spec = PathFinder.find_spec(name, path)
+        execute = spec.loader.exec_module
+
+        def execute_and_change(module):
+            execute(module)
+            runpy.run_path({launcher!r})
+
+        spec.loader.exec_module = execute_and_change
+        return spec
 
 sys.meta_path.insert(0, Finder())
 """
