@@ -87,3 +87,15 @@ def blamed(path: Path, expected: str, **options: object) -> None:
     assert "\n" not in message
     assert seconds < 2.0
     assert peak < 300 * 2**20
+
+
+def reads_or_says_why(path: Path) -> None:
+    """A damaged motion file is read, or refused in one line that begins with its path; nothing else may happen."""
+    try:
+        read_motion(path)
+    except InputError as error:
+        said = str(error)
+    else:
+        said = str(path)
+    assert said.startswith(str(path))
+    assert "\n" not in said

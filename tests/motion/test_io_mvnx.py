@@ -8,12 +8,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.hostile import blamed, run_child
+from helpers.hostile import blamed, reads_or_says_why, run_child
 from helpers.mocap import default_humanoid
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from egopose.core.errors import InputError
 from egopose.motion import rotations as rot
 from egopose.motion.io import mvnx, read_motion
 from egopose.motion.motion import Motion
@@ -216,14 +215,7 @@ def test_damaged_mvnx_reads_or_says_why(walk: Motion, tmp_path: Path, data: st.D
     path.write_bytes(
         raw[:start] + data.draw(st.one_of(st.just(raw[start:stop] * 2), st.binary(max_size=8))) + raw[stop:]
     )
-    try:
-        read_motion(path)
-    except InputError as error:
-        said = str(error)
-    else:
-        said = str(path)
-    assert said.startswith(str(path))
-    assert "\n" not in said
+    reads_or_says_why(path)
 
 
 def test_limits_hold(walk: Motion, tmp_path: Path) -> None:
