@@ -196,7 +196,7 @@ def restart_path(restart: str, env: TransformedEnv, planner: Planner | None) -> 
         whole = problem.followed().path
         path = None if whole is None else FollowedPath(whole, problem.humanoid.control_dt)
     if path is None:
-        raise InputError("failsafe", "restart", "what is followed has no path to restart at: failsafe.restart=own")
+        raise InputError("failsafe", "restart", "the target motion has no path to restart at: failsafe.restart=own")
     return path
 
 

@@ -85,7 +85,7 @@ class PlannerSettings:
             table = build_reward(self.reward)
         except ValueError as error:
             raise InputError("planner", "reward", str(error)) from None
-        # What is followed has a path of the root in the world, and no more; a plan is judged by the body alone.
+        # The target motion has a path of the root in the world, and no more; a plan is judged by the body alone.
         known = all(set(TERMS[term].reads) <= _ON_THE_PATH for term in table.in_world)
         own = any(weight > 0 for term, weight in table.weights.items() if term not in table.in_world)
         cause = "must be of the body alone, in the heading frame but for heading and path"
