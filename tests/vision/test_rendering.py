@@ -18,10 +18,10 @@ from scipy.spatial.transform import Rotation
 from egopose.core.errors import InputError
 from egopose.vision import gl
 from egopose.vision.features import extract_flow
+from egopose.vision.mounts import camera_orientations
 from egopose.vision.rendering import (
     SceneRenderer,
     WearerCamera,
-    camera_orientations,
     side_view_frames,
     wearer_frames,
 )

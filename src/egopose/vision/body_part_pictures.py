@@ -36,7 +36,8 @@ from egopose.motion.skeleton import Skeleton
 from egopose.vision.body_parts import FLOW, LIMBS, PICTURE
 from egopose.vision.flow import FlowConfig, FlowEstimator, grey_square
 from egopose.vision.gl import choose_backend
-from egopose.vision.rendering import WEARER_CAMERA, SceneRenderer, WearerCamera, camera_orientations, furnished_model
+from egopose.vision.mounts import WEARER_CAMERA, camera_orientations
+from egopose.vision.rendering import SceneRenderer, WearerCamera, furnished_model
 from egopose.vision.rooms import Range, draw_room
 from egopose.vision.takes import RenderConfig
 

@@ -16,13 +16,13 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from egopose.motion.rotations import Array, from_axis_angle, from_scipy, multiply, to_scipy
+from egopose.motion.rotations import Array
 from egopose.vision.corruption import Corruption
 from egopose.vision.gl import open_context
+from egopose.vision.mounts import WEARER_CAMERA, camera_orientations
 from egopose.vision.rooms import Range, Room, RoomConfig, draw_room, furnish
 from egopose.vision.video import Frame, write_video
 
-WEARER_CAMERA = "head"
 # Distances of the near and far clipping planes: nearer than the hands come to the eyes, further than any room.
 _NEAR, _FAR = 0.03, 60.0
 # The body's reach above its root, for the ceiling.
@@ -168,29 +168,6 @@ class SceneRenderer:
         mujoco.mjv_updateScene(self.model, self.data, self._options, None, view, every, self._scene)
         mujoco.mjr_render(self._rect, self._scene, self._context)
         mujoco.mjr_readPixels(self._pixels, None, self._rect, self._context)
-
-
-def camera_orientations(model: mujoco.MjModel, angles: Array) -> NDArray[np.float64]:
-    """Quaternions ``[T, 4]`` of the wearer's camera in the head's frame, from yaw, pitch down, roll ``[T, 3]`` (rad).
-
-    The angles are meant as they would be measured on a person standing straight: the model's rest pose says where
-    the head looks then, and its camera ``head`` only in which direction.
-    """
-    data = mujoco.MjData(model)
-    mujoco.mj_kinematics(model, data)
-    mujoco.mj_camlight(model, data)
-    camera = model.camera(WEARER_CAMERA).id
-    ahead = -data.cam_xmat[camera].reshape(3, 3)[:, 2]
-    heading = from_axis_angle(np.array([0.0, 0.0, 1.0]), np.arctan2(ahead[1], ahead[0]))
-    # MuJoCo's camera looks along -z with x to its right: level and along the world's x, in columns.
-    level = from_scipy(to_scipy(np.array([[0.5, 0.5, -0.5, -0.5]])), (1,))[0]
-    turns = [
-        from_axis_angle(np.array(axis), sign * angles[:, column])
-        for axis, sign, column in (((0.0, 1.0, 0.0), 1.0, 0), ((1.0, 0.0, 0.0), -1.0, 1), ((0.0, 0.0, 1.0), 1.0, 2))
-    ]
-    head = data.xquat[model.cam_bodyid[camera]] * np.array([1.0, -1.0, -1.0, -1.0])
-    fixed = multiply(multiply(head, heading), level)
-    return multiply(multiply(multiply(np.broadcast_to(fixed, (len(angles), 4)), turns[0]), turns[1]), turns[2])
 
 
 def furnished_model(model_xml: str, room: Room, config: RoomConfig) -> mujoco.MjModel:
