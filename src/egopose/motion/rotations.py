@@ -106,6 +106,16 @@ def heading(q: Array) -> Array:
     return normalize(h)
 
 
+def yaw(q: Array) -> Array:
+    """Angle ``[...]`` of the :func:`heading` of quaternions ``[..., 4]``, rad within [-pi, pi]; zero faces along x."""
+    return wrapped(2.0 * np.arctan2(q[..., 3], q[..., 0]))
+
+
+def wrapped(angle: Array) -> Array:
+    """Angles ``[...]`` in rad, the same directions within [-pi, pi)."""
+    return (angle + np.pi) % (2.0 * np.pi) - np.pi
+
+
 def continuous(q: Array) -> Array:
     """Signs chosen along the first (time) axis so that neighbours lie on one half-sphere. ``[T, ..., 4]``."""
     flips = np.sum(q[1:] * q[:-1], axis=-1) < 0
