@@ -1,0 +1,164 @@
+"""How a camera turns and moves over the ground between two frames, fitted to optical flow.
+
+A ray X = (x, y, 1) of the camera meets a level floor at 1/Z = (X . d) / h, d being the unit vector down in the
+camera's axes and h the camera's height. A turn w and a velocity V move the picture of a point by
+u = x y wx - (1 + x^2) wy + y wz + (-Vx + x Vz) / Z and v = (1 + y^2) wx - x y wy - x wz + (-Vy + y Vz) / Z
+(Longuet-Higgins & Prazdny 1980, equation 2.6). So w and V / h are linear in the flow under the horizon. Above it the
+depth is unknown: there only the flow across the direction in which V moves a point counts. All six numbers are fitted
+at once by reweighted least squares: a turn fitted alone takes up a third of the walking speed.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from egopose.motion.rotations import Array
+
+#: rad below the horizon at which a point counts as floor: nearer to it, 1/Z is mostly error.
+_BELOW = float(np.deg2rad(8.0))
+#: Heights a second: the prior of velocities ahead, left and up. It decides where no ground is seen: people stand or walk.
+_USUAL = np.array([1.5, 0.4, 0.4])
+#: Inverse depth of points off the ground, in camera heights: a wall stands half a height to infinitely far away.
+_INVERSE_DEPTH = 0.5
+#: Neighbouring flow vectors share their errors; so many count as one.
+_SHARED = 16.0
+#: Smallest deviation of flow, in focal lengths a frame: what DIS rounds to.
+_LEAST = 2e-4
+_ROUNDS = 8
+_BATCH = 256  # frames at a time
+
+
+@dataclass(frozen=True)
+class GroundMotion:
+    """What :func:`fit_ground_motion` finds in each frame.
+
+    Args:
+        turn: ``[T, 3]`` rad a frame in the camera's axes (x right, y down, z ahead).
+        velocity: ``[T, 3]`` camera heights a frame, in the same axes.
+        deviation: ``[T]`` standard deviation of the velocity, heights a frame.
+        turn_deviation: ``[T]`` standard deviation of the turn, rad a frame.
+        share: ``[T]`` in 0..1: the weight of the points below the horizon that move as the floor does.
+        ground: ``[T]`` in 0..1: the share of the picture that lies below the horizon.
+    """
+
+    turn: Array
+    velocity: Array
+    deviation: Array
+    turn_deviation: Array
+    share: Array
+    ground: Array
+
+
+def pixel_rays(height: int, width: int, field_of_view: float) -> tuple[Array, float]:
+    """Rays ``[2, height * width]`` (x, y at unit depth) of a pinhole picture, and its focal length in widths.
+
+    ``field_of_view`` is in degrees across the width; pixels are square.
+    """
+    focal = 0.5 / float(np.tan(np.deg2rad(0.5 * field_of_view)))
+    x = ((np.arange(width) + 0.5) / width - 0.5) / focal
+    y = ((np.arange(height) + 0.5) / height - 0.5) * height / width / focal
+    across, down = np.meshgrid(x, y)
+    return np.stack([across.ravel(), down.ravel()]), focal
+
+
+def gravity_axes(down: Array) -> Array:
+    """``[T, 3, 3]``: rows are the axes ahead, left, up in the camera's axes, from unit vectors down ``[T, 3]``.
+
+    Ahead is the optical axis without its vertical part. Where that vanishes, the picture's upper edge is ahead.
+    """
+    steep = np.abs(down[:, 2:]) > 0.999
+    view = np.where(steep, np.array([0.0, -1.0, 0.0]), np.array([0.0, 0.0, 1.0]))
+    ahead = view - (view * down).sum(1, keepdims=True) * down
+    ahead /= np.linalg.norm(ahead, axis=1, keepdims=True)
+    return np.stack([ahead, np.cross(-down, ahead), -down], axis=1)
+
+
+def fit_ground_motion(moved: Array, rays: Array, down: Array, fps: float, turn: Array | None = None) -> GroundMotion:
+    """Turn and velocity of every frame.
+
+    Args:
+        moved: ``[T, 2, P]`` flow in focal lengths a frame, right and down, at ``rays``.
+        rays: ``[2, P]``, see :func:`pixel_rays`.
+        down: ``[T, 3]`` unit vectors down in the camera's axes.
+        fps: frames/s, for the prior of velocities.
+        turn: ``[T, 3]`` rad a frame where a gyroscope knows it; None fits it too.
+    """
+    parts = []
+    for at in range(0, len(moved), _BATCH):
+        rows = slice(at, at + _BATCH)
+        known = None if turn is None else turn[rows]
+        parts.append(_fit(moved[rows], rays, down[rows], fps, known))
+    if not parts:
+        none = np.zeros(0)
+        return GroundMotion(np.zeros((0, 3)), np.zeros((0, 3)), none, none, none, none)
+    return GroundMotion(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+
+
+def _fit(
+    moved: Array, rays: Array, down: Array, fps: float, known: Array | None
+) -> tuple[Array, Array, Array, Array, Array, Array]:
+    x, y = rays
+    depth = x * down[:, :1] + y * down[:, 1:2] + down[:, 2:]
+    floor = depth > np.sin(_BELOW) * np.sqrt(1 + x * x + y * y)
+    depth = np.where(floor, depth, 0.0)
+    count, pixels = depth.shape
+    axes = gravity_axes(down)
+    prior = np.zeros((count, 6, 6))
+    prior[:, 3:, 3:] = np.einsum("tij,i,tik->tjk", axes, (fps / _USUAL) ** 2, axes)
+    right, below = np.empty((count, 6, pixels)), np.empty((count, 6, pixels))
+    right[:, :3], below[:, :3] = (x * y, -(1 + x * x), y), (1 + y * y, -x * y, -x)
+    right[:, 3], right[:, 4], right[:, 5] = -depth, 0.0, depth * x
+    below[:, 3], below[:, 4], below[:, 5] = 0.0, -depth, depth * y
+    wanted, first = moved, 0
+    fitted = np.zeros((count, 6))
+    if known is not None:
+        fitted[:, :3] = known
+        wanted = moved - np.stack([np.einsum("ti,tip->tp", known, j[:, :3]) for j in (right, below)], 1)
+        right, below, prior, first = right[:, 3:], below[:, 3:], prior[:, 3:, 3:], 3
+    normal, weight, square = _reweighted(wanted, right, below, floor, prior, rays, fitted, first)
+    spread = np.linalg.inv(normal) * (square * _SHARED)[:, None, None]
+    variances = np.diagonal(spread, axis1=1, axis2=2)
+    share = (weight * floor).sum(1) / np.maximum(floor.sum(1), 1)
+    turned = np.sqrt(variances[:, :3].max(1)) if known is None else np.zeros(count)
+    moves = np.sqrt(variances[:, -3:].max(1))
+    return fitted[:, :3], fitted[:, 3:], moves, turned, share, floor.mean(1)
+
+
+def _reweighted(
+    moved: Array, right: Array, below: Array, floor: Array, prior: Array, rays: Array, fitted: Array, first: int
+) -> tuple[Array, Array, Array]:
+    """Fill ``fitted [T, 6]`` from column ``first`` on; returns the normal matrix, weights ``[T, P]`` and variances.
+
+    Each point's error is split into the direction in which the velocity moves it and the one across. Along the former
+    a point of unknown depth may be anywhere (:data:`_INVERSE_DEPTH`). Weights are Cauchy's.
+    """
+    x, y = rays
+    tiny = 1e-12 * np.eye(right.shape[1])
+    normal, weight = prior, np.ones_like(floor, dtype=np.float64)
+    square = np.full(len(moved), (10 * _LEAST) ** 2)
+    for _ in range(_ROUNDS):
+        velocity, own = fitted[:, 3:], fitted[:, first:]
+        error_right = moved[:, 0] - np.einsum("ti,tip->tp", own, right)
+        error_below = moved[:, 1] - np.einsum("ti,tip->tp", own, below)
+        # The first round has no velocity yet, and any direction will do.
+        along_right = 1e-9 - velocity[:, :1] + x * velocity[:, 2:]
+        along_below = -velocity[:, 1:2] + y * velocity[:, 2:]
+        speed = np.maximum(np.hypot(along_right, along_below), 1e-12)
+        cos, sin = along_right / speed, along_below / speed
+        along, across = error_right * cos + error_below * sin, error_below * cos - error_right * sin
+        seen = np.where(floor, np.hypot(along, across), np.abs(across))
+        square = (1.48 * np.median(seen, axis=1) + _LEAST) ** 2
+        one = square[:, None]
+        wide = np.where(floor, one, one + (_INVERSE_DEPTH * speed) ** 2)
+        weight = 1.0 / (1.0 + along**2 / wide + across**2 / one)
+        first_rows, second_rows = right * cos[:, None] + below * sin[:, None], below * cos[:, None] - right * sin[:, None]
+        first_weight, second_weight = weight * one / wide, weight
+        first_moved, second_moved = moved[:, 0] * cos + moved[:, 1] * sin, moved[:, 1] * cos - moved[:, 0] * sin
+        first_weighted, second_weighted = first_rows * first_weight[:, None], second_rows * second_weight[:, None]
+        normal = first_weighted @ first_rows.transpose(0, 2, 1) + second_weighted @ second_rows.transpose(0, 2, 1)
+        normal = normal + prior * one[..., None] * _SHARED + tiny
+        target = first_weighted @ first_moved[..., None] + second_weighted @ second_moved[..., None]
+        fitted[:, first:] = np.linalg.solve(normal, target)[..., 0]
+    return normal, weight, square
