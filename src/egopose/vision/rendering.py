@@ -134,7 +134,7 @@ class SceneRenderer:
         return np.flipud(self._pixels).copy()
 
     def render_rows(self, qpos: Array, camera: str, top: int, bottom: int) -> Frame:
-        """Rows ``top`` to ``bottom`` (not included) of :meth:`render`'s picture, at little more than their share of time.
+        """Rows ``top`` to ``bottom`` (not included) of :meth:`render`'s picture, for about their share of its time.
 
         Raises as :meth:`render`.
         """

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
+from egopose.motion.rotations import Array
 from egopose.vision.places import things
 from egopose.vision.places.pictures import ground_picture, wall_picture
 from egopose.vision.places.place import Builder, Way, paint, pattern_materials
@@ -89,7 +90,7 @@ def draw_furnished_room(seed: int, way: Way) -> FurnishedRoom:
     height = max(rng.uniform(2.4, 4.0), way.top + 0.3)
     found: list[tuple[str, float, float, float]] = []
 
-    def stand(kind: str, place: np.ndarray, turn: float) -> bool:
+    def stand(kind: str, place: Array, turn: float) -> bool:
         reach = _REACHES[kind]
         free = way.distance(place) > reach + _CLEARANCE
         apart = all(np.hypot(place[0] - x, place[1] - y) > 0.8 * (reach + _REACHES[k]) for k, x, y, _ in found)

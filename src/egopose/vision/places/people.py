@@ -72,17 +72,17 @@ def add_people(spec: mujoco.MjSpec, rng: np.random.Generator, passers: tuple[Pas
     for i, passer in enumerate(passers):
         shirt, trousers, skin = (str(c) for c in rng.choice(clothes, 3))
         s = passer.scale
-        shapes = {
-            "trunk": [((0, 0, _HIP), (0, 0, _SHOULDER - 0.1), 0.15, shirt), ((0, 0, 1.58), (0, 0, 1.66), 0.1, skin)],
-            "leg": [((0, 0, 0), (0, 0, -0.42), 0.075, trousers), ((0, 0, -0.42), (0.02, 0, -0.85), 0.055, trousers)],
-            "arm": [((0, 0, 0), (0, 0, -0.28), 0.05, shirt), ((0, 0, -0.28), (0.06, 0, -0.6), 0.04, skin)],
+        shapes: dict[str, list[tuple[tuple[float, ...], float, str]]] = {
+            "trunk": [((0, 0, _HIP, 0, 0, _SHOULDER - 0.1), 0.15, shirt), ((0, 0, 1.58, 0, 0, 1.66), 0.1, skin)],
+            "leg": [((0, 0, 0, 0, 0, -0.42), 0.075, trousers), ((0, 0, -0.42, 0.02, 0, -0.85), 0.055, trousers)],
+            "arm": [((0, 0, 0, 0, 0, -0.28), 0.05, shirt), ((0, 0, -0.28, 0.06, 0, -0.6), 0.04, skin)],
         }
         for part in _PARTS:
             body = spec.worldbody.add_body(name=f"person{i}_{part}", mocap=True)
-            for start, stop, radius, cloth in shapes[part.split("_")[-1]]:
+            for ends, radius, cloth in shapes[part.split("_")[-1]]:
                 body.add_geom(
                     type=mujoco.mjtGeom.mjGEOM_CAPSULE,
-                    fromto=[s * value for value in (*start, *stop)],
+                    fromto=[s * value for value in ends],
                     size=[s * radius, 0, 0],
                     material=cloth,
                     contype=0,

@@ -122,7 +122,7 @@ def ground_picture(rng: np.random.Generator, kind: str, size: int, metres: float
 
 
 def wall_picture(rng: np.random.Generator, size: int) -> NDArray[np.uint8]:
-    """An inner wall ``[size, size, 3]``: plaster with faint marks, sometimes wallpaper; plainer than a room's pattern."""
+    """An inner wall ``[size, size, 3]``: plaster with faint marks, sometimes wallpaper."""
     base = np.array([200.0, 195.0, 185.0]) * rng.uniform(0.6, 1.1) + rng.normal(scale=15.0, size=3)
     shade = rng.uniform(4.0, 14.0) * octaves(rng, size, 2, size // 2)
     if rng.random() < 0.5:

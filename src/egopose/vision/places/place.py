@@ -149,7 +149,7 @@ def pattern_materials(
     contrast: tuple[float, float],
     base: tuple[float, float],
 ) -> list[str]:
-    """Names of ``count`` materials of random patterns for solid shapes (:func:`egopose.vision.surfaces.random_pattern`)."""
+    """Names of ``count`` materials of random patterns for solid shapes."""
     names = [f"{name}{i}" for i in range(count)]
     for each in names:
         add_cube_material(spec, each, rng, 128, contrast, base)

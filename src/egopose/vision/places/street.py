@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import mujoco
@@ -81,7 +82,9 @@ class Street:
                 things.tree(b.at(x, across(kerb + _ROAD + 0.8)), rng, leaves, wood)
         add_lights(spec, rng)
 
-    def _fronts(self, b: Builder, rng: np.random.Generator, spec: mujoco.MjSpec, across, reach: float) -> None:  # type: ignore[no-untyped-def]
+    def _fronts(
+        self, b: Builder, rng: np.random.Generator, spec: mujoco.MjSpec, across: Callable[[float], float], reach: float
+    ) -> None:
         """Rows of buildings that face the road."""
         shapes = rng.uniform([8.0, 6.0], [_BLOCK, 14.0], (5, 2))
         pictures = [paint(spec, f"street_front{i}", front_picture(rng, *shape)) for i, shape in enumerate(shapes)]
