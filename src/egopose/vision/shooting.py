@@ -7,7 +7,7 @@ turned by the camera's angular velocity. So turns are right to the row, and what
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from types import TracebackType
 
@@ -19,7 +19,6 @@ from numpy.typing import NDArray
 from egopose.core.errors import InputError
 from egopose.motion.rotations import Array
 from egopose.vision.lens import Camera
-from egopose.vision.places.people import Passer, place_people
 from egopose.vision.places.scenery import FILM_CAMERA
 from egopose.vision.rendering import SceneRenderer
 from egopose.vision.video import Frame
@@ -30,6 +29,9 @@ _WIDEST_TANGENT = 2.4
 _MARGIN = 1.04
 # Widest lenses, degrees across and to the corner: two pinholes turned by a third of the width see no further.
 _WIDEST = {"pinhole": 125.0, "fisheye": 140.0}
+
+# Puts what moves in a scene where it is at a time (s).
+Move = Callable[[mujoco.MjModel, mujoco.MjData, float], None]
 
 
 @dataclass(frozen=True)
@@ -142,14 +144,14 @@ class Shooter:
         model: of :func:`egopose.vision.places.scenery.scenery_model`.
         optics: of the camera.
         far: m, what lies further is not drawn.
-        passers: people to be moved.
+        move: puts what moves in the scene where it is at a time (s).
 
     Raises:
         RuntimeError: no OpenGL here.
     """
 
-    def __init__(self, model: mujoco.MjModel, optics: Optics, far: float, passers: tuple[Passer, ...] = ()) -> None:
-        self.optics, self._passers = optics, passers
+    def __init__(self, model: mujoco.MjModel, optics: Optics, far: float, move: Move) -> None:
+        self.optics, self._move = optics, move
         self._rays = optics.rays()
         self._plain = optics.lens == "pinhole" and optics.crop == 0.0
         self._views = _views(optics)
@@ -232,7 +234,7 @@ class Shooter:
         mujoco.mju_mat2Quat(renderer.model.cam_quat[self._camera], np.ascontiguousarray(axes).ravel())
         renderer.model.cam_pos[self._camera] = moment.position
         renderer.model.cam_fovy[self._camera] = np.rad2deg(2 * np.arctan(tangent))
-        place_people(renderer.model, renderer.data, self._passers, moment.time)
+        self._move(renderer.model, renderer.data, moment.time)
         return renderer
 
 

@@ -13,7 +13,7 @@ from egopose.vision.mounts import WEARER_CAMERA
 from egopose.vision.places import things
 from egopose.vision.places.furnished_room import draw_furnished_room
 from egopose.vision.places.open_ground import draw_open_ground
-from egopose.vision.places.people import Passer, add_people, draw_passers
+from egopose.vision.places.people import Passer, add_people, draw_passers, place_people
 from egopose.vision.places.place import Builder, Place, Way, clear, pattern_materials
 from egopose.vision.places.street import draw_street
 from egopose.vision.surfaces import ROOM_BASE, dress
@@ -39,6 +39,10 @@ class Scenery:
     passers: tuple[Passer, ...]
     table: tuple[float, float, float] | None
     seed: int
+
+    def move(self, model: mujoco.MjModel, data: mujoco.MjData, time: float) -> None:
+        """Put the people where they are at a time (s)."""
+        place_people(model, data, self.passers, time)
 
 
 def draw_scenery(kind: str, seed: int, way: Way, people: bool = False, table: bool = False) -> Scenery:
