@@ -51,8 +51,8 @@ def extract_flow(
     if finder is not None:
         frames = _remembered(frames, pictures)
     flow = np.stack(list(flow_of_frames(frames, config)))
-    if camera is not None and camera.readout:
-        flow = undo_rolling_shutter(flow, camera.readout, 1.0 / fps)
+    if camera is not None and camera.delay:
+        flow = undo_rolling_shutter(flow, camera.delay, 1.0 / fps)
     if finder is None:
         return flow
     return np.concatenate([flow, as_plane(body_part_rows(finder, pictures, flow), config.stored_size)], axis=1)
@@ -86,7 +86,7 @@ def _frames(
     info = probe_video(path)
     rectify = camera.rectifier(info.width, info.height, config.working_size)
     # The middle row, which stands for the frame, is exposed half a readout after its stamp.
-    return map(rectify, iter_frames(path, fps, offset - 0.5 * camera.readout, count, camera.fps))
+    return map(rectify, iter_frames(path, fps, offset - 0.5 * camera.delay, count, camera.fps))
 
 
 def _remembered(frames: Iterator[Frame], pictures: list[Picture]) -> Iterator[Frame]:

@@ -75,8 +75,8 @@ class FrameFeatures:
     ) -> NDArray[np.float32]:
         flow = self._estimator(before[1], now)
         interval = time - before[0]
-        if self._camera.readout:
-            flow = undo_rolling_shutter(flow, self._camera.readout, interval)
+        if self._camera.delay:
+            flow = undo_rolling_shutter(flow, self._camera.delay, interval)
         passed = interval * self._rate
         whole = max(round(passed), 1)
         return flow.astype(np.float32) / np.float32(whole if abs(passed - whole) < _ROUNDING else passed)

@@ -32,12 +32,12 @@ class Trajectory:
 
     Args:
         times: ``[N]`` s.
-        position: ``[N, 3]`` m.
+        position: ``[N, 3]`` m, or None where only the orientation is known.
         orientation: ``[N, 4]`` wxyz, from camera axes to the world.
     """
 
     times: Array
-    position: Array
+    position: Array | None
     orientation: Array
 
 
