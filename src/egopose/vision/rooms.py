@@ -114,6 +114,12 @@ def furnish(spec: mujoco.MjSpec, room: Room, config: RoomConfig) -> None:
     for thing in [*spec.worldbody.geoms, *spec.worldbody.lights]:
         spec.delete(thing)
     rng = np.random.default_rng([room.seed, 1])
+    build(spec, room, config, rng)
+    dress(spec, rng, config.texture_size // 2)
+
+
+def build(spec: mujoco.MjSpec, room: Room, config: RoomConfig, rng: np.random.Generator) -> None:
+    """Put a room's surfaces, furniture and lights into a spec; ``rng`` draws their looks."""
     scale = rng.uniform(*config.texture_scale)
     _walls(spec, room, rng, config.texture_size, scale)
     for i in range(_WOODS):
@@ -126,7 +132,6 @@ def furnish(spec: mujoco.MjSpec, room: Room, config: RoomConfig) -> None:
         turn = from_axis_angle(_UP, np.array(piece.yaw))
         add_geom(spec, f"room_piece{i}", shape, size, position, turn, f"room_wood{piece.wood}")
     add_lights(spec, rng)
-    dress(spec, rng, config.texture_size // 2)
 
 
 def _walls(spec: mujoco.MjSpec, room: Room, rng: np.random.Generator, size: int, scale: float) -> None:

@@ -59,7 +59,7 @@ class Optics:
             raise InputError("film", "size", f"{self.width} x {self.height}; 16 to 4096 pixels a side")
         if not 0.0 <= self.crop <= 0.5:
             raise InputError("film", "crop", f"{self.crop}; 0 to 0.5")
-        widest = _WIDEST.get(self.camera.lens, 0.0)
+        widest = _WIDEST[self.camera.kind]
         if not 10.0 <= self.field_of_view <= widest:
             raise InputError(
                 "film", "field_of_view", f"{self.field_of_view}; 10 to {widest:g} degrees of a {self.lens}"

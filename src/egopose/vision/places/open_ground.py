@@ -74,7 +74,7 @@ class OpenGround:
                 things.tree(at, rng, leaves, wood)
             else:
                 size = rng.uniform([4.0, 4.0, 4.0], [12.0, 12.0, 14.0])
-                things.building(at, str(rng.choice(fronts)), (size[0], size[1]), size[2])
+                things.building(at, str(rng.choice(fronts)), far, (size[0], size[1]), size[2])
         add_lights(spec, rng)
 
     def _cliff(self, b: Builder, near: str, far: str, middle: Array) -> None:

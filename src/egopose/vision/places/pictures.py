@@ -104,7 +104,8 @@ def ground_picture(rng: np.random.Generator, kind: str, size: int, metres: float
     # Down to pixels, or to 2 cm where pixels are finer.
     finest = int(min(size, metres / 0.02))
     fine = octaves(rng, size, max(finest // 8, 2), finest, 0.0)
-    broad = octaves(rng, size, 2, max(finest // 8, 4))
+    # Every octave alike: seen at a slant and from afar, decimetres and metres are all that flow can grip.
+    broad = octaves(rng, size, 2, max(finest // 4, 4), 0.0)
     if kind in _ACROSS:
         detail, strength = _laid(kind, rng, size, metres), 0.30
         detail = detail if detail.any() else fine
@@ -117,7 +118,7 @@ def ground_picture(rng: np.random.Generator, kind: str, size: int, metres: float
         detail, strength = fine - 1.0 * mended - 1.5 * cracks, 0.16 if kind == "asphalt" else 0.22
     tint = np.stack([octaves(rng, size, 2, 16) for _ in range(3)], axis=-1)
     colour = np.array(_COLOURS[kind], np.float32) * rng.uniform(0.8, 1.2) + rng.normal(scale=6.0, size=3)
-    light = 1 + strength * detail + 0.14 * broad
+    light = 1 + strength * detail + 0.2 * broad
     return np.clip(colour * light[..., None] + 5.0 * tint, 0, 255).astype(np.uint8)
 
 

@@ -129,8 +129,9 @@ def car(b: Builder, rng: np.random.Generator, paints: Sequence[str], dark: str) 
             b.add(mujoco.mjtGeom.mjGEOM_CYLINDER, (x * length, y * wide, 0.32), (0.32, 0.1, 0.0), dark, turn)
 
 
-def building(b: Builder, front: str, half: tuple[float, float], high: float) -> None:
-    """A block with its front on all four sides."""
+def building(b: Builder, front: str, roof: str, half: tuple[float, float], high: float) -> None:
+    """A block with its front on all four sides, and a flat roof."""
+    b.floor(0, 0, high, half, roof)
     for facing, depth, wide in ((0.0, half[0], half[1]), (np.pi, half[0], half[1])):
         b.wall(depth * np.cos(facing), 0, 0, facing, (wide, 0.5 * high), front)
     for facing in (0.5 * np.pi, -0.5 * np.pi):
