@@ -32,6 +32,15 @@ _ASPECTS = {"1:1": 1.0, "4:3": 4 / 3, "16:9": 16 / 9}
 
 
 @dataclass(frozen=True)
+class _Numbers:
+    """Those of a film's settings that are plain numbers."""
+
+    pinhole_widest: float
+    people: float
+    table: float
+
+
+@dataclass(frozen=True)
 class FilmRanges:
     """What a take draws beside ``camera`` and ``room`` (``conf/vision/film.yaml``).
 
@@ -58,7 +67,9 @@ class FilmRanges:
         """
         known = {"places": (PLAIN_ROOM, *PLACES), "mounts": MOUNTS, "lenses": LENSES, "aspects": tuple(_ASPECTS)}
         shares = {name: _shares(name, values.get(name), allowed) for name, allowed in known.items()}
-        result = from_mapping(cls, {**values, **shares}, f"{_SOURCE}: film")
+        numbers = from_mapping(_Numbers, {k: v for k, v in values.items() if k not in known}, f"{_SOURCE}: film")
+        places, mounts, lenses, aspects = shares.values()
+        result = cls(places, mounts, lenses, aspects, numbers.pinhole_widest, numbers.people, numbers.table)
         for name in ("people", "table"):
             if not 0.0 <= getattr(result, name) <= 1.0:
                 raise InputError(_SOURCE, f"film.{name}", f"{getattr(result, name)}; a share from 0 to 1")

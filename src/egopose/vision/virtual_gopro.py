@@ -147,9 +147,10 @@ def film(
         InputError: a motion or a setting that cannot be, or no place to write to.
         RuntimeError: no OpenGL here.
     """
+    poses = Poses(qpos, motion_fps)
     scenery = draw_scenery(settings.place, settings.seed, Way.of(qpos), settings.people, settings.table)
     model = scenery_model(scenery, model_xml)
-    return film_worn(model_xml, Poses(qpos, motion_fps), path, settings, model, scenery.place.far, scenery.move)
+    return film_worn(model_xml, poses, path, settings, model, scenery.place.far, scenery.move)
 
 
 def film_worn(

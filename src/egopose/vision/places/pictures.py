@@ -116,10 +116,12 @@ def ground_picture(rng: np.random.Generator, kind: str, size: int, metres: float
         mended = octaves(rng, size, 3, 24, 0.5) > 1.2
         cracks = np.abs(octaves(rng, size, 4, 128, 0.6)) < 0.03
         detail, strength = fine - 1.0 * mended - 1.5 * cracks, 0.16 if kind == "asphalt" else 0.22
-    tint = np.stack([octaves(rng, size, 2, 16) for _ in range(3)], axis=-1)
-    colour = np.array(_COLOURS[kind], np.float32) * rng.uniform(0.8, 1.2) + rng.normal(scale=6.0, size=3)
-    light = 1 + strength * detail + 0.2 * broad
-    return np.clip(colour * light[..., None] + 5.0 * tint, 0, 255).astype(np.uint8)
+    colour = np.array(_COLOURS[kind]) * rng.uniform(0.8, 1.2) + rng.normal(scale=6.0, size=3)
+    # Hues change slowly over the ground.
+    tinted = colour + 5.0 * np.stack([octaves(rng, 64, 2, 16) for _ in range(3)], axis=-1)
+    wide = cv2.resize(tinted.astype(np.float32), (size, size), interpolation=cv2.INTER_LINEAR)
+    light = np.asarray(1 + strength * detail + 0.2 * broad, np.float32)
+    return np.clip(wide * light[..., None], 0, 255).astype(np.uint8)
 
 
 def wall_picture(rng: np.random.Generator, size: int) -> NDArray[np.uint8]:
