@@ -25,7 +25,8 @@ from egopose.vision.rendering import (
     side_view_frames,
     wearer_frames,
 )
-from egopose.vision.rooms import draw_room, furnish, random_pattern, room_seed
+from egopose.vision.rooms import draw_room, furnish, room_seed
+from egopose.vision.surfaces import random_pattern
 from egopose.vision.takes import RenderConfig, RenderJob, is_rendered, render_takes
 from egopose.vision.video import probe_video, read_frames
 

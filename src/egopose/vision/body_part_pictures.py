@@ -38,7 +38,8 @@ from egopose.vision.flow import FlowConfig, FlowEstimator, grey_square
 from egopose.vision.gl import choose_backend
 from egopose.vision.mounts import WEARER_CAMERA, camera_orientations
 from egopose.vision.rendering import SceneRenderer, WearerCamera, furnished_model
-from egopose.vision.rooms import Range, draw_room
+from egopose.vision.rooms import draw_room
+from egopose.vision.surfaces import Range
 from egopose.vision.takes import RenderConfig
 
 #: Bodies whose positions in the camera's frame (x right, y up, z back; m) make the first part of a posture.

@@ -173,22 +173,25 @@ def _of_frames(name: str, values: Array | None, count: int) -> Array:
 def held_sway(rng: np.random.Generator, count: int, fps: float) -> tuple[Array, Array]:
     """How a hand that holds a camera sways against the trunk: angles ``[count, 3]`` rad and shifts ``[count, 3]`` m.
 
-    Both are normal noise through two low passes, so that neither jumps from frame to frame.
-
     Args:
         rng: what it is drawn with.
         count: frames.
         fps: frames/s.
     """
-    keep = float(np.exp(-2.0 / (_SWAY_TIME * fps)))
+    unit = slow_noise(rng, count, 6, _SWAY_TIME, fps)
+    return np.deg2rad(_SWAY_ANGLE) * unit[:, :3], _SWAY * unit[:, 3:]
+
+
+def slow_noise(rng: np.random.Generator, count: int, columns: int, time: float, fps: float) -> Array:
+    """Noise ``[count, columns]`` of deviation 1, correlated over ``time`` s: two low passes, so that it never jumps."""
+    keep = float(np.exp(-2.0 / (time * fps)))
     # Run in over several times the correlation: the first frame sways as much as the last.
-    lead = int(np.ceil(5 * _SWAY_TIME * fps))
-    state, sway = np.zeros((2, 6)), np.empty((lead + count, 6))
-    for t, noise in enumerate(rng.normal(size=(lead + count, 6))):
+    lead = int(np.ceil(5 * time * fps))
+    state, sway = np.zeros((2, columns)), np.empty((lead + count, columns))
+    for t, noise in enumerate(rng.normal(size=(lead + count, columns))):
         state[0] = keep * state[0] + (1 - keep) * noise
         state[1] = keep * state[1] + (1 - keep) * state[0]
         sway[t] = state[1]
     # Variance of unit white noise after two equal low passes.
     deviation = np.sqrt((1 - keep) ** 4 * (1 + keep**2) / (1 - keep**2) ** 3)
-    unit = sway[lead:] / deviation
-    return np.deg2rad(_SWAY_ANGLE) * unit[:, :3], _SWAY * unit[:, 3:]
+    return np.asarray(sway[lead:] / deviation)

@@ -20,7 +20,8 @@ from egopose.motion.rotations import Array
 from egopose.vision.corruption import Corruption
 from egopose.vision.gl import open_context
 from egopose.vision.mounts import WEARER_CAMERA, camera_orientations
-from egopose.vision.rooms import Range, Room, RoomConfig, draw_room, furnish
+from egopose.vision.rooms import Room, RoomConfig, draw_room, furnish
+from egopose.vision.surfaces import Range
 from egopose.vision.video import Frame, write_video
 
 # Distances of the near and far clipping planes: nearer than the hands come to the eyes, further than any room.
@@ -82,18 +83,19 @@ class SceneRenderer:
     Args:
         model: any MuJoCo model; it is copied.
         width, height: of the pictures, pixels.
+        far: m, what lies further is not drawn.
 
     Raises:
         RuntimeError: no OpenGL here; the message says what to install.
     """
 
-    def __init__(self, model: mujoco.MjModel, width: int, height: int) -> None:
+    def __init__(self, model: mujoco.MjModel, width: int, height: int, far: float = _FAR) -> None:
         self.model = copy.copy(model)
         visual = self.model.vis
         visual.global_.offwidth, visual.global_.offheight = max(width, 64), max(height, 64)
         visual.quality.offsamples = 0
         visual.quality.shadowsize = 0
-        visual.map.znear, visual.map.zfar = _NEAR / self.model.stat.extent, _FAR / self.model.stat.extent
+        visual.map.znear, visual.map.zfar = _NEAR / self.model.stat.extent, far / self.model.stat.extent
         self.data = mujoco.MjData(self.model)
         self._pixels = np.empty((height, width, 3), np.uint8)
         self._rect = mujoco.MjrRect(0, 0, width, height)
@@ -131,6 +133,14 @@ class SceneRenderer:
         self._draw(qpos, camera)
         return np.flipud(self._pixels).copy()
 
+    def render_rows(self, qpos: Array, camera: str, top: int, bottom: int) -> Frame:
+        """Rows ``top`` to ``bottom`` (not included) of :meth:`render`'s picture, for about their share of its time.
+
+        Raises as :meth:`render`.
+        """
+        self._draw(qpos, camera, (top, bottom))
+        return np.flipud(self._pixels[: bottom - top])
+
     def segment(self, qpos: Array, camera: str | mujoco.MjvCamera) -> NDArray[np.int32]:
         """Which geom each pixel of :meth:`render`'s picture shows: its id ``[height, width]``, -1 for none.
 
@@ -150,7 +160,7 @@ class SceneRenderer:
                 ids[geom.segid + 1] = geom.objid
         return np.flipud(ids[np.minimum(shown, len(ids) - 1)]).copy()
 
-    def _draw(self, qpos: Array, camera: str | mujoco.MjvCamera) -> None:
+    def _draw(self, qpos: Array, camera: str | mujoco.MjvCamera, rows: tuple[int, int] | None = None) -> None:
         if self._gl is None:
             raise ValueError("the renderer is closed")
         self.data.qpos[:] = qpos
@@ -166,8 +176,19 @@ class SceneRenderer:
         self._gl.make_current()
         every = mujoco.mjtCatBit.mjCAT_ALL
         mujoco.mjv_updateScene(self.model, self.data, self._options, None, view, every, self._scene)
-        mujoco.mjr_render(self._rect, self._scene, self._context)
-        mujoco.mjr_readPixels(self._pixels, None, self._rect, self._context)
+        if rows is None:
+            mujoco.mjr_render(self._rect, self._scene, self._context)
+            mujoco.mjr_readPixels(self._pixels, None, self._rect, self._context)
+            return
+        height, width = self._pixels.shape[:2]
+        for eye in self._scene.camera:
+            low, high = eye.frustum_bottom, eye.frustum_top
+            eye.frustum_width = 0.5 * (high - low) * width / height
+            eye.frustum_top = high - (high - low) * rows[0] / height
+            eye.frustum_bottom = high - (high - low) * rows[1] / height
+        part = mujoco.MjrRect(0, 0, width, rows[1] - rows[0])
+        mujoco.mjr_render(part, self._scene, self._context)
+        mujoco.mjr_readPixels(self._pixels[: rows[1] - rows[0]], None, part, self._context)
 
 
 def furnished_model(model_xml: str, room: Room, config: RoomConfig) -> mujoco.MjModel:
