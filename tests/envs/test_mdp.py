@@ -37,6 +37,7 @@ WORLD = {
     "world_end_effector": {"scale": 40.0},
     "centre_of_mass": {"scale": 10.0},
 }
+PATH = {"heading": {"scale": 4.0}, "path": {"scale": 2.0}}
 
 
 def table(
@@ -213,6 +214,43 @@ def test_heading_turn_and_travel_change_nothing(body, yaw: float, x: float, y: f
     np.testing.assert_allclose(z, obs.humanoid_state(moved(a, yaw, (x, y))), atol=1e-9)
 
 
+@given(st.floats(-9.0, 9.0), st.floats(-3.0, 3.0), st.floats(-3.0, 3.0))
+@settings(deadline=None, max_examples=30)
+def test_heading_and_path_are_of_the_angle_and_the_distance_a_body_was_moved_by(
+    body, yaw: float, x: float, y: float
+) -> None:
+    _, reference, layout = body
+    a = reference[:10]
+    b, step = moved(a, yaw, (0.0, 0.0)), torch.zeros(10)
+    b["qpos"][:, :2] = a["qpos"][:, :2] + torch.tensor([x, y], dtype=torch.float64)
+    _, terms = judged(table(dict.fromkeys(PATH, 1.0), PATH), layout, b, a, step)
+    short = np.arccos(np.cos(yaw))
+    np.testing.assert_allclose(terms["heading"], np.full(10, np.exp(-4.0 * short**2)), atol=1e-6)
+    np.testing.assert_allclose(terms["path"], np.full(10, np.exp(-2.0 * (x**2 + y**2))), rtol=1e-9)
+
+
+def test_parts_of_a_table_add_up_to_the_whole(body) -> None:
+    _, reference, layout = body
+    a, b, step = reference[:10], reference[10:20], torch.zeros(10)
+    for combine in ("mean", "sum"):
+        whole = table({**WEIGHTS, "heading": 0.4, "path": 0.2}, {**SCALES, **PATH}, combine=combine, decay_horizon=7)
+        own, world = whole.part(WEIGHTS), whole.part(whole.in_world)
+        assert (own.names, world.names) == (tuple(WEIGHTS), ("heading", "path"))
+        parts = sum(judged(part, layout, a, b, step)[0] for part in (own, world))
+        np.testing.assert_allclose(parts, judged(whole, layout, a, b, step)[0], rtol=1e-12)
+
+
+def test_the_file_with_the_path_weighs_the_papers_terms_as_the_paper_does() -> None:
+    paper, ours = (
+        rewards.build_reward(compose_config("train", [f"reward={name}"])["reward"])
+        for name in ("estimation", "estimation_path")
+    )
+    assert ours.in_world == ("heading", "path")
+    own = ours.part(paper.names)
+    assert {name: own.weights[name] for name in paper.names} == pytest.approx(dict(paper.weights))
+    assert {name: ours.parameters[name] for name in paper.names} == dict(paper.parameters)
+
+
 def test_deepmimic_sees_travel(body) -> None:
     _, reference, layout = body
     a = reference[:10]
@@ -309,7 +347,7 @@ def test_every_term_reads_what_it_says(body) -> None:
         if not term.function.__module__.startswith("egopose."):
             continue
         kept = SimpleNamespace(**{attribute: getattr(whole, attribute) for attribute in term.reads})
-        values = {**SCALES, **WORLD}[name]
+        values = {**SCALES, **WORLD, **PATH}[name]
         metric = {"metric": "angle"} if name in ("pose", "root_pose", "world_pose") else {}
         few = term.function(StepView(body_view, kept, torch.zeros(4)), **values, **metric)
         all_of_it = term.function(StepView(body_view, whole, torch.zeros(4)), **values, **metric)
@@ -389,7 +427,10 @@ def test_fall_is_a_head_below_the_take(body) -> None:
     assert fallen(head, torch.full((2,), 1.5, dtype=torch.float64), 0.1).tolist() == [False, True]
 
 
-@pytest.mark.parametrize("reward", [table(WEIGHTS, SCALES), table(WORLD_WEIGHTS, WORLD, "angle")])
+@pytest.mark.parametrize(
+    "reward",
+    [table(WEIGHTS, SCALES), table(WORLD_WEIGHTS, WORLD, "angle"), table(dict.fromkeys(PATH, 1.0), PATH)],
+)
 def test_every_equation_stays_on_the_device_of_its_tensors(body, reward: rewards.RewardTable) -> None:
     """On ``meta`` tensors a constant made on another device, or a value read on the host, raises."""
     _, reference, layout = body

@@ -16,7 +16,9 @@ FPS = 30.0
 UP = np.array([0.0, 0.0, 1.0])
 
 
-def circle(seconds: float, speed: float, radius: float, at: Array | None = None, facing: float = 0.0) -> tuple[Array, Array]:
+def circle(
+    seconds: float, speed: float, radius: float, at: Array | None = None, facing: float = 0.0
+) -> tuple[Array, Array]:
     """Path and heading of a walk at ``speed`` m/s on a circle that turns left, from ``at`` and along ``facing``."""
     time = np.arange(round(seconds * FPS) + 1) / FPS
     heading = facing + speed / radius * time

@@ -104,7 +104,8 @@ def test_what_is_followed_is_every_step_of_every_curve(dataset: Dataset) -> None
     futures = dataset.forecasts
     assert futures is not None
     starts = torch.tensor([17, 3, 8])
-    states, row = followed_forecasts(futures, starts)
+    states, row, path = followed_forecasts(futures, starts)
+    assert path is None
     assert states.shape == (3 * 13, dataset.states.shape[1])
     start, step = starts.repeat(20), torch.arange(20).repeat_interleave(3)
     rows = row({"episode_start": start[:, None], "episode_step": step[:, None], "frame": torch.zeros(60, 1).long()})
@@ -246,7 +247,8 @@ def test_each_lot_of_windows_has_a_planner_that_follows_its_curves(agent: Agent,
     assert [one.closed for one in made] == [True, True]
     now = nows(agent, WINDOWS)
     for one, part in zip(made, (now[:2], now[2:]), strict=True):
-        env, actor, critic, used, (states, row) = one.given
+        env, actor, critic, used, (states, row, path) = one.given
+        assert path is None
         assert (actor, critic, used) == (agent.actor, agent.critic, chosen)
         assert env.batch_size == torch.Size([12 * len(part)])
         steps = torch.arange(13).repeat(len(part))

@@ -23,6 +23,7 @@ from egopose.core.errors import InputError
 from egopose.core.torch_settings import enable_onednn_matmul
 from egopose.envs.env import EgoPoseEnv
 from egopose.envs.forecasting_transforms import RecurrentStates
+from egopose.envs.mdp import rotations as rot
 from egopose.envs.mdp.observations import humanoid_state
 from egopose.envs.problem import Followed, global_frame
 from egopose.envs.starts import Piece
@@ -486,11 +487,17 @@ def test_a_later_round_tries_what_lies_between_and_about_the_best(samples: int, 
         ({"head": -1.0}, "head"),
         ({"margin": -1.0}, "margin"),
         ({"tie_tolerance": -0.1}, "tie_tolerance"),
+        ({"place_time": 0.0}, "place_time"),
+        ({"heading_time": -1.0}, "heading_time"),
         ({"discount": 0.0}, "discount"),
         ({"discount": 1.1}, "discount"),
         ({"reward": None}, "reward"),
         ({"reward": group("reward", "deepmimic")}, "reward"),
         ({"reward": {**group("reward", "estimation"), "combine": "product"}}, "reward"),
+        (
+            {"reward": {**group("reward", "estimation_path"), "terms": {"path": {"weight": 1.0, "scale": 1.0}}}},
+            "reward",
+        ),
         ({"horizon": "far"}, "horizon"),
         ({"speed": 3}, "speed"),
     ],
@@ -573,6 +580,101 @@ def test_estimates_plan_unless_they_are_causal_or_told_not_to() -> None:
     for name, words in (("evaluate", []), ("estimate", ["video=none"])):
         without = compose_config(name, ["checkpoint=none", "planner=none", *words])
         assert planner_settings(without.get("planner")) is None
+
+
+# --- the path --------------------------------------------------------------------------------------------------------
+
+
+def along(x: float = 0.0, turn: float = 0.0) -> Tensor:
+    """A path ``[2 * FRAMES, 3]`` of both takes at ``x`` m/s straight ahead and ``turn`` rad/s."""
+    time = torch.arange(FRAMES, dtype=torch.float64).repeat(2) / 30
+    return torch.stack([x * time, 0 * time, turn * time], dim=-1)
+
+
+def path_reward(weight: float) -> dict[str, Any]:
+    """The paper's, with heading and path of that weight."""
+    table = group("reward", "estimation_path")
+    ours = {name: {**table["terms"][name], "weight": weight} for name in ("heading", "path")}
+    return {**table, "terms": {**table["terms"], **ours}}
+
+
+def planner_on(path: Tensor | None, reward: dict[str, Any], seed: int = 0) -> Planner:
+    changes = {"samples": 32, "horizon": 12, "every": 6, "deviation": 0.4, "acceleration": 0.0, "margin": 0.0}
+    chosen = settings(**{**SMALL, **changes, "place_time": np.inf, "reward": reward, "seed": seed})
+    copies, states = frozen(make_env(2 * chosen.samples)), states_of(true_motion()[0])
+    return Planner(copies, passive(), critic(), chosen, Followed(states, global_frame, path))
+
+
+def path_terms(turn: Tensor, away: Tensor) -> Tensor:
+    """Of bodies that face ``turn [N]`` rad and stand ``away [N, 2]`` m from the path."""
+    scales = {name: group("reward", "estimation_path")["terms"][name]["scale"] for name in ("heading", "path")}
+    return torch.exp(-scales["heading"] * turn**2) + torch.exp(-scales["path"] * away.square().sum(-1))
+
+
+def strayed(path: Tensor, weight: float, seed: int) -> tuple[float, float]:
+    """How far (rad, m) the bodies' headings and places are from a path in the first 24 frames, in the mean."""
+    env, planner = make_env(2), planner_on(path, path_reward(weight), seed)
+    frozen(env).reset()
+    base, errors = base_of(env), []
+    for _ in range(24):
+        env.step(TensorDict({"action": planner.perturbation(base)}, base.batch_size))
+        assert planner.path is not None
+        (place, heading), qpos = planner.path.at(base.frame), base.body_state()["qpos"]
+        turn = rot.wrapped(rot.yaw(qpos[:, 3:7]) - heading).abs()
+        errors.append(torch.stack([turn, (qpos[:, :2] - place).norm(dim=-1)]))
+    env.close()
+    turn, way = torch.stack(errors).mean((0, 2)).tolist()
+    return turn, way
+
+
+@pytest.mark.parametrize(("path", "number", "share"), [(along(turn=np.pi / 2), 0, 0.75), (along(x=1.0), 1, 0.96)])
+def test_a_body_keeps_closer_to_a_path_that_counts(path: Tensor, number: int, share: float) -> None:
+    # A body that stands and sways, and is to turn by 90 degrees a second, or to go a metre a second.
+    without, with_it = (np.mean([strayed(path, weight, seed)[number] for seed in (0, 1)]) for weight in (0.0, 5.0))
+    assert with_it < share * without
+
+
+def test_the_path_is_chosen_by_and_no_part_of_the_value() -> None:
+    base, candidates = leaning(make_env(2)), None
+    found = []
+    for weight in (0.0, 2.0):
+        planner = planner_on(along(x=1.0, turn=1.0), path_reward(weight))
+        candidates = planner._perturbations(planner.settings.samples) if candidates is None else candidates
+        assert planner.path is not None
+        planner.path.advance(base.frame, base.body_state()["qpos"])
+        found.append(planner._tried(base.state_dict(), candidates))
+    (score, returns, low), (score_along, returns_along, low_along) = found
+    assert torch.equal(returns, returns_along)
+    assert torch.equal(low, low_along)
+    # By hand, of a candidate: what two terms of weight 2 add at most, and what they add to it.
+    gained = score_along - score
+    assert (gained > 0).all()
+    assert (gained <= 4.0 * sum(0.99**step for step in range(12)) + 1e-4).all()
+    here = frozen(make_env(2))
+    here.reset()
+    body = base_of(here)
+    body.load_state_dict(base.state_dict())
+    observation, expected = here.transform(body.observe()), torch.zeros(2, dtype=torch.float64)
+    begin = base.body_state()["qpos"]
+    for step in range(12):
+        observation["action"] = candidates[5, :, step]
+        observation = here.step(observation)["next"].exclude("reward", "action")
+        qpos, passed = body.body_state()["qpos"], (step + 1) / 30
+        turn = rot.wrapped(rot.yaw(qpos[:, 3:7]) - rot.yaw(begin[:, 3:7]) - 1.0 * passed)
+        # The path is straight in its own world, where the body has turned by what the path's heading is by now.
+        facing = rot.yaw(begin[:, 3:7]) - along(turn=1.0)[base.frame, 2]
+        way = torch.stack([facing.cos(), facing.sin()], dim=-1) * passed
+        expected += 0.99**step * 2.0 * path_terms(turn, qpos[:, :2] - begin[:, :2] - way)
+    torch.testing.assert_close(gained[5], expected.float(), rtol=0, atol=1e-4)
+
+
+def test_what_has_no_path_is_planned_for_as_without_its_terms() -> None:
+    base, plans = leaning(make_env(2)), []
+    for reward in (group("reward", "estimation"), path_reward(5.0)):
+        planner = planner_on(None, reward)
+        assert planner.path is None
+        plans.append(planner.perturbation(base))
+    assert torch.equal(*plans)
 
 
 # --- rescue ----------------------------------------------------------------------------------------------------------

@@ -18,6 +18,7 @@ from egopose.envs.problem import BODY_KEYS, Followed, Scene, TakeTable, global_f
 from egopose.envs.reference_forecasts import ReferenceForecasts
 from egopose.humanoid.model import HumanoidModel
 from egopose.humanoid.torques import torque_driven
+from egopose.models.pose_regression import integrated_path
 
 
 @dataclass(frozen=True)
@@ -78,9 +79,12 @@ class ImitationProblem:
         action_reference: ``[F, nu]`` rad, the base target for reaching each frame; needed by ``regressor``.
         forecasts: kinematic forecasts: episodes begin in their first states in place of the reference's.
         states: ``[F, 2 nq - 3]`` humanoid states that bodies follow at test time, or None.
+        path: ``[F, 3]`` x, y (m) and heading (rad) of the root that they follow with the states; None for the path that
+            the states' own velocities give.
 
     Raises:
-        ValueError: the reference does not fit the humanoid, or the action's table is missing or of another shape.
+        ValueError: the reference does not fit the humanoid, or the action's table or the path is missing or of another
+            shape.
     """
 
     def __init__(
@@ -94,6 +98,7 @@ class ImitationProblem:
         action_reference: Tensor | None = None,
         forecasts: ReferenceForecasts | None = None,
         states: Tensor | None = None,
+        path: Tensor | None = None,
     ) -> None:
         if action.kind == "torque":
             humanoid = torque_driven(humanoid, action.joint_damping)
@@ -107,6 +112,9 @@ class ImitationProblem:
             raise ValueError(
                 f"reference has {reference['xpos'].shape[1]} bodies, the humanoid {len(humanoid.body_ids)}"
             )
+        if path is not None and path.shape != (reference.shape[0], 3):
+            raise ValueError(f"a path needs x, y and heading [{reference.shape[0]}, 3], got {list(path.shape)}")
+        self.path = path
         self.humanoid, self.takes, self.reward = humanoid, takes, reward
         self.action, self.termination, self.forecasts, self.states = action, termination, forecasts, states
         self.observation_sizes: Mapping[str, int] = {"humanoid_state": 2 * model.nq - 3}
@@ -229,6 +237,8 @@ class ImitationProblem:
     def followed(self, starts: Tensor | None = None) -> Followed:
         """What bodies follow: the forecasts that begin at ``starts [W]``, each once, or the states of every frame.
 
+        Forecasts have no path.
+
         Raises:
             ValueError: there is nothing to follow.
         """
@@ -236,7 +246,17 @@ class ImitationProblem:
             return followed_forecasts(self.forecasts, starts)
         if self.states is None:
             raise ValueError("there is no state regressor whose states bodies could follow")
-        return Followed(self.states, global_frame)
+        return Followed(self.states, global_frame, self._integrated() if self.path is None else self.path.double())
+
+    def _integrated(self) -> Tensor:
+        """``[F, 3]`` the path of :attr:`states`, each take from the origin and along x."""
+        assert self.states is not None
+        spans = zip(self.takes.offsets.tolist(), self.takes.lengths.tolist(), strict=True)
+        path = torch.zeros(self.n_frames, 3, dtype=torch.float64)
+        for offset, length in spans:
+            rows = self.states[offset : offset + length].double().numpy()
+            path[offset : offset + length] = torch.from_numpy(integrated_path(rows, 1.0 / self.humanoid.control_dt))
+        return path
 
 
 def followed_forecasts(forecasts: ReferenceForecasts, starts: Tensor) -> Followed:

@@ -42,10 +42,13 @@ class Followed(NamedTuple):
     Attributes:
         states: ``[R, 2 nq - 3]`` humanoid states.
         row: which of them each body should be in now.
+        path: ``[R, 3]`` x, y (m) and heading (rad) of the root, in a world of its own for each take; None where there
+            is none. Only how the rows of a take lie to each other counts.
     """
 
     states: Tensor
     row: Rows
+    path: Tensor | None = None
 
 
 def global_frame(entries: Mapping[str, Tensor]) -> Tensor:

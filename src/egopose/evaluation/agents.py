@@ -16,7 +16,7 @@ from egopose.envs.test_time import Controller
 from egopose.evaluation.protocols import ContactSettings, TakeScores, score_take
 from egopose.evaluation.resets import TakeTriggers, as_dict, take_triggers
 from egopose.inference.counterfactuals import CounterfactualRollouts
-from egopose.inference.estimator import Estimate, estimate_takes
+from egopose.inference.estimator import Estimate, estimate_takes, restart_path
 from egopose.inference.failsafe import FailSafe, FailSafeSettings
 from egopose.inference.planner import Planner
 from egopose.inference.planner_settings import PlannerSettings, planned_threshold
@@ -145,8 +145,16 @@ def _together(
     ahead = None
     if planner is not None:
         ahead = Planner(make_env(worlds * planner.samples), agent.actor, agent.critic, planner)
+    restart = restart_path(failsafe.restart, env, ahead)
     estimates = estimate_takes(
-        env, agent.actor, agent.critic, states, guard, counterfactuals=counterfactuals, planner=ahead
+        env,
+        agent.actor,
+        agent.critic,
+        states,
+        guard,
+        counterfactuals=counterfactuals,
+        planner=ahead,
+        restart=restart,
     )
     env.close()
     if ahead is not None:

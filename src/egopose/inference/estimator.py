@@ -2,8 +2,9 @@
 
 Yuan & Kitani 2019, sections 3.1 and 3.3: the first state is the regressor's, placed where the person stands and faces;
 from there the policy's mean action drives the humanoid. Where the fail-safe triggers at frame t, the humanoid restarts
-at frame t + 1 from the regressor's state, at its own place and heading. With a planner, which is beyond the paper, the
-mean action is where planning begins, and V(s_t) is what the best plan is worth.
+at frame t + 1 from the regressor's state, at its own place and heading. Two things are beyond the paper. The humanoid
+may restart at the place and heading of the path that is followed (:mod:`egopose.inference.followed_path`). With a
+planner, the mean action is where planning begins, and V(s_t) is what the best plan is worth.
 """
 
 from __future__ import annotations
@@ -17,12 +18,14 @@ from torch import Tensor
 from torchrl.envs import TransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
+from egopose.core.errors import InputError
 from egopose.envs.env import EgoPoseEnv
 from egopose.envs.test_time import Controller, prepare_for_test
 from egopose.humanoid.foot_geometry import out_of_floor
 from egopose.humanoid.model import HumanoidModel
 from egopose.inference.counterfactuals import CounterfactualRollouts
 from egopose.inference.failsafe import FailSafe
+from egopose.inference.followed_path import FollowedPath
 from egopose.inference.planner import Planner
 from egopose.models.pose_regression import state_to_qpos
 from egopose.motion import rotations as rot
@@ -92,6 +95,7 @@ def estimate_takes(
     lookahead: int | None = None,
     counterfactuals: CounterfactualRollouts | None = None,
     planner: Planner | None = None,
+    restart: FollowedPath | None = None,
 ) -> list[Estimate]:
     """Run every world's fragment from its first frame to its last.
 
@@ -107,6 +111,8 @@ def estimate_takes(
             come with the observation are the caller's.
         counterfactuals: is told the states in which the fail-safe triggered.
         planner: of as many bodies; None for the policy alone.
+        restart: the path at whose place and heading bodies restart, with a row for every global frame; the planner's
+            own, where there is a planner. None: they restart at their own.
 
     Returns:
         One :class:`Estimate` a world; fragments may differ in length.
@@ -128,6 +134,8 @@ def estimate_takes(
     with set_exploration_type(ExplorationType.DETERMINISTIC):
         for t in range(int(lengths.max())):
             body = base.body_state()
+            if restart is not None and planner is None:  # a planner moves its path on by itself
+                restart.advance(base.frame, body["qpos"])
             observation = critic(actor(observation))
             value = observation["state_value"].squeeze(-1)
             if planner is not None:
@@ -146,7 +154,10 @@ def estimate_takes(
             placed = (triggered | diverged) & (t + 1 < lengths)
             again = placed.nonzero().squeeze(-1)
             if len(again):
-                _restart(base, again, states[start[again] + t + 1], body["qpos"][again])
+                where = body["qpos"][again]
+                if restart is not None:
+                    where = _on_path(where, *restart.at(start[again] + t + 1, again))
+                _restart(base, again, states[start[again] + t + 1], where)
                 if planner is not None:
                     planner.forget(again)
                 after = env.transform(base.observe())
@@ -166,6 +177,34 @@ def estimate_takes(
         )
         for i, n in enumerate(lengths.tolist())
     ]
+
+
+def restart_path(restart: str, env: TransformedEnv, planner: Planner | None) -> FollowedPath | None:
+    """The path at which bodies of ``env`` restart, by ``failsafe.restart``; None for ``own``.
+
+    It is the planner's. Without a planner nothing draws a body to its path, and the path is not drawn to the body.
+
+    Raises:
+        InputError: what the bodies follow has no path.
+    """
+    if restart == "own":
+        return None
+    if planner is not None:
+        path = planner.path
+    else:
+        problem = env.base_env.problem
+        whole = problem.followed().path
+        path = None if whole is None else FollowedPath(whole, problem.humanoid.control_dt)
+    if path is None:
+        raise InputError("failsafe", "restart", "the target motion has no path to restart at: failsafe.restart=own")
+    return path
+
+
+def _on_path(qpos: Tensor, place: Tensor, heading: Tensor) -> Tensor:
+    """``qpos [n, nq]`` standing at ``place [n, 2]`` m and facing ``heading [n]`` rad; the rest does not matter."""
+    quaternion = torch.zeros(len(qpos), 4, dtype=qpos.dtype)
+    quaternion[:, 0], quaternion[:, 3] = torch.cos(0.5 * heading), torch.sin(0.5 * heading)
+    return torch.cat([place, qpos[:, 2:3], quaternion, qpos[:, 7:]], dim=-1)
 
 
 def _restart(base: EgoPoseEnv, worlds: Tensor, states: Tensor, qpos: Tensor) -> None:

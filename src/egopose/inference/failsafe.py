@@ -30,18 +30,23 @@ class FailSafeSettings:
         reset_threshold: fraction of the mean value under which the state counts as unstable; None for
             :func:`paper_threshold` of the discount the values were learned with, see :meth:`for_run`.
         fallen_height: head height (m) under which the humanoid counts as fallen, for ``naive``.
+        restart: ``own``: the humanoid restarts at its own place and heading (the paper); ``path``: at those of the path
+            that is followed, see :mod:`egopose.inference.followed_path`.
 
     Raises:
-        InputError: an unknown mode.
+        InputError: an unknown mode or restart.
     """
 
     mode: str
     reset_threshold: float | None
     fallen_height: float
+    restart: str = "own"
 
     def __post_init__(self) -> None:
         if self.mode not in MODES:
             raise InputError("failsafe", "mode", f"must be one of {', '.join(MODES)}, not {self.mode!r}")
+        if self.restart not in ("own", "path"):
+            raise InputError("failsafe", "restart", f"must be own or path, not {self.restart!r}")
 
     def for_run(self, config: Mapping[str, Any], planned: float | None = None) -> FailSafeSettings:
         """With a threshold: its own, else ``planned`` (meant for a planner's values), else the paper's.

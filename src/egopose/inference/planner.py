@@ -6,6 +6,10 @@ action plus a smooth perturbation; the policy reacts in each. Chance alone rarel
 joints. So later rounds try candidates between and around the best ones (the cross-entropy method: Rubinstein 1999; in
 control: Chua et al. 2018, PETS). Candidates are compared with the target motion: the state regressor's, or a kinematic
 forecast. The true motion plays no part.
+
+The paper's terms of reward are in each body's own heading frame: a turn or a step that was not made costs nothing once
+it is past. Terms in the world (``heading``, ``path``) hold bodies to the path that is followed, see
+:mod:`egopose.inference.followed_path`.
 """
 
 from __future__ import annotations
@@ -27,6 +31,7 @@ from egopose.envs.mdp.rewards import build_reward
 from egopose.envs.mdp.step_view import StepView
 from egopose.envs.problem import Followed
 from egopose.humanoid.physics import PER_WORLD
+from egopose.inference.followed_path import FollowedPath
 from egopose.inference.planner_settings import PlannerSettings
 from egopose.models.pose_regression import state_to_qpos
 
@@ -51,8 +56,11 @@ class Planner:
         followed: the target motion; None for the problem's own, of all frames.
 
     Attributes:
+        path: the target motion's in the worlds of the bodies; None where it has none, and the reward's terms in the
+            world are then left out.
         value: ``[N]`` return of the best candidate: discounted rewards and, at the horizon, V. It is 0 while the head
-            is more than ``lost`` below its target, so that a fallen body is reset.
+            is more than ``lost`` below its target, so that a fallen body is reset. Terms in the world are no part of
+            it: a body that strayed is not lost.
 
     Raises:
         InputError: actions are torques, the policy has a memory, or no hinge is named.
@@ -80,8 +88,14 @@ class Planner:
         gaussian = isinstance(actor, ProbabilisticTensorDictSequential)
         self._actor = [part for step in (actor.module[:-1] if gaussian else [actor]) for part in parts_of(step)]
         self._action, self._critic = "loc" if gaussian else "action", parts_of(critic)
-        self._reward = build_reward(settings.reward)
-        states, self._row = problem.followed() if followed is None else followed
+        states, self._row, path = problem.followed() if followed is None else followed
+        table = build_reward(settings.reward)
+        self._reward = table.part(set(table.names) - set(table.in_world)) if table.in_world else table
+        along = [term for term in table.in_world if table.weights[term] > 0]
+        self._path_reward = table.part(along) if along and path is not None else None
+        self.path = None
+        if path is not None:
+            self.path = FollowedPath(path, humanoid.control_dt, settings.place_time, settings.heading_time)
         env.reset()
         self._followed, self._head_height = self._what_is_followed(states)
         hinges = [joint.name for joint in humanoid.skeleton.joints for _ in joint.dofs]
@@ -115,13 +129,16 @@ class Planner:
     def perturbation(self, base: EgoPoseEnv) -> Tensor:
         """``[N, nu]`` to add to the policy's mean action in the present state of ``base`` (N environments).
 
-        Every ``every`` frames it plans anew.
+        Called once a frame. Every ``every`` frames it plans anew.
         """
+        row = self._row(base.observe())
+        if self.path is not None:
+            self.path.advance(row, base.body_state()["qpos"])
         if self._age % self.settings.every == 0:
             self._look_ahead(base)
         self._age += 1
         head = torch.as_tensor(base.body_state()["xpos"])[:, base.problem.humanoid.head, 2]
-        low = self._head_height[self._row(base.observe())] - head > self.settings.lost
+        low = self._head_height[row] - head > self.settings.lost
         self.value = torch.where(low, 0.0, self._returns)
         now = self._plan[:, 0].clone()
         self._plan = self._plan.roll(-1, 1)
@@ -200,8 +217,8 @@ class Planner:
         """Simulate ``candidates [K, N, H, nu]`` from the bodies' state ``now``.
 
         Returns:
-            Of each candidate ``[K, N]``: rewards less costs, rewards alone, and by how many metres the head ends below
-            its target.
+            Of each candidate ``[K, N]``: all rewards less costs, rewards in the heading frame alone, and by how many
+            metres the head ends below its target.
         """
         settings, copies, problem = self.settings, self._base, self._base.problem
         self._copy(now)
@@ -214,7 +231,12 @@ class Planner:
             body, after = copies.try_step(seen[self._action] + candidates[:, :, step].flatten(0, 1))
             row = self._row(after)
             followed = SimpleNamespace(**{name: rows.index_select(0, row) for name, rows in self._followed.items()})
-            reward, _ = self._reward(StepView(body, followed, after["episode_step"].squeeze(-1)))
+            view = StepView(body, followed, after["episode_step"].squeeze(-1))
+            reward, _ = self._reward(view)
+            if self._path_reward is not None and self.path is not None:
+                followed.place, followed.yaw = self.path.at(row)
+                along, _ = self._path_reward(view)
+                cost -= kept * along.float()
             low = (self._head_height[row] - body.xpos[:, problem.humanoid.head, 2]).clamp(min=0.0)
             velocity = body.qvel.numpy()
             acceleration = torch.from_numpy(np.abs(velocity - before).mean(1) * rate)

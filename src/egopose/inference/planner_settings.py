@@ -8,7 +8,10 @@ from typing import Any
 
 from egopose.core.config import from_mapping
 from egopose.core.errors import InputError
-from egopose.envs.mdp.rewards import build_reward
+from egopose.envs.mdp.rewards import TERMS, build_reward
+
+#: What a followed path tells of a body in the world, as :class:`egopose.envs.mdp.observations.BodyView` names it.
+_ON_THE_PATH = {"place", "yaw"}
 
 
 @dataclass(frozen=True)
@@ -33,9 +36,12 @@ class PlannerSettings:
         margin: reward by which a candidate must beat the current plan, and either must beat no perturbation.
         tie_tolerance: reward; candidates no further than this below the best are near-ties. Near-ties go to the
             candidate closest to the current plan.
+        place_time, heading_time: s; the time constants with which the path that is followed approaches the body, see
+            :class:`egopose.inference.followed_path.FollowedPath`. Infinity (``.inf``) for never.
         discount: of a frame.
         reset_threshold: of the fail-safe for a planner's values, if the fail-safe has none of its own.
-        reward: as a file of ``conf/reward`` in the heading frame: compares the body with the target motion.
+        reward: as a file of ``conf/reward``: compares the body with the target motion. Its terms are in the heading
+            frame, or compare heading or place of the root in the world.
         seed: of the perturbations.
     """
 
@@ -54,6 +60,8 @@ class PlannerSettings:
     lost: float
     margin: float
     tie_tolerance: float
+    place_time: float
+    heading_time: float
     discount: float
     reset_threshold: float
     reward: Any
@@ -67,7 +75,7 @@ class PlannerSettings:
         check(self.samples >= 3, "samples", "must be at least 3: no perturbation, the current plan, and a new one")
         check(self.rounds >= 1, "rounds", "must be at least 1")
         check(0 < self.every <= self.horizon, "every", "must lie between 1 and the horizon")
-        for name in ("knot_spacing", "deviation", "lost", "height_drop", "wider"):
+        for name in ("knot_spacing", "deviation", "lost", "height_drop", "wider", "place_time", "heading_time"):
             check(getattr(self, name) > 0, name, "must be positive")
         for name in ("recovery_rounds", "acceleration", "head", "margin", "tie_tolerance"):
             check(getattr(self, name) >= 0, name, "must not be negative")
@@ -77,8 +85,11 @@ class PlannerSettings:
             table = build_reward(self.reward)
         except ValueError as error:
             raise InputError("planner", "reward", str(error)) from None
-        # The target motion has no place in the world, and a plan is judged by the body alone.
-        check(not table.in_world and not table.needs, "reward", "must be of the body alone, in the heading frame")
+        # The target motion has a path of the root in the world, and no more; a plan is judged by the body alone.
+        known = all(set(TERMS[term].reads) <= _ON_THE_PATH for term in table.in_world)
+        own = any(weight > 0 for term, weight in table.weights.items() if term not in table.in_world)
+        cause = "must be of the body alone, in the heading frame but for heading and path"
+        check(known and own and not table.needs, "reward", cause)
 
 
 def planned_threshold(settings: PlannerSettings | None) -> float | None:

@@ -13,7 +13,7 @@ from egopose.core.config import from_mapping
 from egopose.core.errors import InputError
 from egopose.core.result_files import write_columns_csv
 from egopose.data.preparation import humanoid_of
-from egopose.inference.estimator import estimate_takes
+from egopose.inference.estimator import estimate_takes, restart_path
 from egopose.inference.failsafe import FailSafe, FailSafeSettings
 from egopose.inference.outputs import TakeVideo, write_footage, write_motion_files, write_side_by_side
 from egopose.inference.planner import Planner
@@ -62,7 +62,10 @@ def run_estimate(config: Mapping[str, Any], agent: Agent, pose_motion: Motion, v
     if settings is not None:
         copies = agent.make_env("test", num_envs=settings.samples, **{**options, "threads": int(config["threads"])})
         planner = Planner(copies, agent.actor, agent.critic, settings)
-    (estimate,) = estimate_takes(env, agent.actor, agent.critic, states, guard, lookahead, planner=planner)
+    restart = restart_path(failsafe.restart, env, planner)
+    (estimate,) = estimate_takes(
+        env, agent.actor, agent.critic, states, guard, lookahead, planner=planner, restart=restart
+    )
     env.close()
     if planner is not None:
         planner.close()

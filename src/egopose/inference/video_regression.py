@@ -97,7 +97,9 @@ def require_estimation(run: Mapping[str, Any], checkpoint: str | Path) -> None:
         raise InputError(checkpoint, "task", "this run forecasts; an estimation policy is needed here")
 
 
-def video_dataset(humanoid: HumanoidModel, seen: Mapping[str, Tensor], name: str) -> tuple[Dataset, Motion]:
+def video_dataset(
+    humanoid: HumanoidModel, seen: Mapping[str, Tensor], name: str, path: Tensor | None = None
+) -> tuple[Dataset, Motion]:
     """The dataset of a video: one take, whose reference is the state regressor's own estimate.
 
     There is no mocap. PoseReg's motion takes its place, from the origin and facing along x. It gives the policy its
@@ -107,6 +109,8 @@ def video_dataset(humanoid: HumanoidModel, seen: Mapping[str, Tensor], name: str
         humanoid: the run's.
         seen: of T frames, see :func:`seen_in`.
         name: of the take.
+        path: ``[T, 3]`` x, y (m) and heading (rad) of the root, if something else tells it better than the regressor;
+            None for the path of the regressor's own velocities.
 
     Returns:
         The dataset and PoseReg's motion.
@@ -135,6 +139,7 @@ def video_dataset(humanoid: HumanoidModel, seen: Mapping[str, Tensor], name: str
         visual_context=seen["visual_context"],
         joint_targets=seen["joint_targets"],
         states=seen["humanoid_state"],
+        path=path,
     )
     return dataset, motion
 

@@ -110,6 +110,17 @@ def integrate_root(parts: StateParts, position: Array, heading: Array, fps: floa
     return np.concatenate([np.zeros((1, 2)), np.cumsum(steps, axis=0)]) + position, headings
 
 
+def integrated_path(state: Array, fps: float) -> Array:
+    """``[T, 3]`` x, y (m) and heading (rad, without jumps of a whole turn) of the root, by :func:`integrate_root`.
+
+    Args:
+        state: z ``[T, 11 + 2 D]`` of a take; its first frame is at the origin and faces along x.
+        fps: frames per second.
+    """
+    positions, headings = integrate_root(split_state(state), np.zeros(2), np.array([1.0, 0.0, 0.0, 0.0]), fps)
+    return np.column_stack([positions, np.unwrap(rot.yaw(headings))])
+
+
 def pose_regression(
     state: Array,
     skeleton: Skeleton,

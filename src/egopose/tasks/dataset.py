@@ -41,6 +41,8 @@ class Dataset:
         visual_context: ``[F, C]`` of the state regressor, or None.
         joint_targets: ``[F, nu]`` rad of the state regressor, or None.
         states: ``[F, S]`` humanoid states of the state regressor, or None.
+        path: ``[F, 3]`` x, y (m) and heading (rad) of the root that bodies follow with the states; None for what the
+            states' own velocities give. Each take may have a world of its own.
         regressor: folder of the state regressor's weights, or None.
         store_fingerprint: of the store it all comes from, or None.
         forecasts: kinematic forecasts a policy follows, or None.
@@ -55,6 +57,7 @@ class Dataset:
     visual_context: Tensor | None = None
     joint_targets: Tensor | None = None
     states: Tensor | None = None
+    path: Tensor | None = None
     regressor: Path | None = None
     store_fingerprint: str | None = None
     forecasts: ReferenceForecasts | None = None

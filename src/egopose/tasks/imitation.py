@@ -59,6 +59,7 @@ class ImitationTask:
             dataset.joint_targets,
             dataset.forecasts,
             dataset.states,
+            dataset.path,
         )
 
     def transforms(self, config: Mapping[str, Any], dataset: Dataset, problem: Problem) -> list[Transform]:

@@ -73,6 +73,16 @@ class BodyView:
         return rot.heading(self.root_quaternion)
 
     @cached_property
+    def yaw(self) -> Tensor:
+        """``[N]`` rad, the angle of :attr:`heading`, within [-pi, pi]; zero faces along the world's x."""
+        return rot.yaw(self.root_quaternion)
+
+    @cached_property
+    def place(self) -> Tensor:
+        """``[N, 2]`` m, x and y of the root in the world."""
+        return self.qpos[:, :2]
+
+    @cached_property
     def heading_matrix(self) -> Tensor:
         """``[N, 3, 3]``: a row vector of the world times it is in the heading frame."""
         return rot.matrix(self.heading)

@@ -8,7 +8,7 @@ not name weighs nothing.
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
@@ -146,6 +146,21 @@ def centre_of_mass(view: StepView, *, scale: float) -> Tensor:
     return torch.exp(-scale * _squares(view.body.centre_of_mass, view.reference.centre_of_mass))
 
 
+@reward_term(reads=("yaw",), in_world=True)
+def heading(view: StepView, *, scale: float) -> Tensor:
+    """exp(-scale dpsi^2) of the angle (rad, the short way round) between the roots' headings in the world ``[N]``.
+
+    The paper's terms are in each body's own heading frame, where a turn that was not made costs nothing later.
+    """
+    return torch.exp(-scale * rot.wrapped(view.body.yaw - view.reference.yaw).square())
+
+
+@reward_term(reads=("place",), in_world=True)
+def path(view: StepView, *, scale: float) -> Tensor:
+    """exp(-scale |p - p^|^2) of the roots' places (m, level) in the world ``[N]``."""
+    return torch.exp(-scale * _squares(view.body.place, view.reference.place))
+
+
 @dataclass(frozen=True)
 class RewardTable:
     """A reward as a table of terms.
@@ -192,6 +207,16 @@ class RewardTable:
     def in_world(self) -> tuple[str, ...]:
         """The terms that depend on where the body stands and faces; none where all is in the heading frame."""
         return tuple(term for term in self.weights if TERMS[term].in_world)
+
+    def part(self, terms: Collection[str]) -> RewardTable:
+        """The table of these terms alone; each adds to the reward what it adds in the whole table.
+
+        Raises:
+            ValueError: none of them weighs anything.
+        """
+        whole = sum(self.weights.values()) if self.combine == "mean" else 1.0
+        weights = {term: weight / whole for term, weight in self.weights.items() if term in terms}
+        return RewardTable(weights, self.parameters, "sum", self.decay_horizon)
 
     @property
     def needs(self) -> frozenset[str]:

@@ -66,6 +66,16 @@ def heading(q: Tensor) -> Tensor:
     return kept / torch.linalg.vector_norm(kept, dim=-1, keepdim=True)
 
 
+def yaw(q: Tensor) -> Tensor:
+    """Angle ``[...]`` of the :func:`heading` of quaternions ``[..., 4]``, rad; zero faces along x."""
+    return wrapped(2.0 * torch.atan2(q[..., 3], q[..., 0]))
+
+
+def wrapped(angle: Tensor) -> Tensor:
+    """Angles ``[...]`` in rad, the same directions within [-pi, pi)."""
+    return torch.remainder(angle + torch.pi, 2.0 * torch.pi) - torch.pi
+
+
 def turn_back(heading: Tensor, q: Tensor) -> Tensor:
     """``conj(heading) * q`` of a :func:`heading` and quaternions, both ``[..., 4]``.
 
