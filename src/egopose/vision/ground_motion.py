@@ -20,12 +20,15 @@ from egopose.motion.rotations import Array
 _BELOW = float(np.deg2rad(8.0))
 #: Heights a second: the prior of velocities ahead, left and up. It decides where no ground is seen: people stand or walk.
 _USUAL = np.array([1.5, 0.4, 0.4])
-#: Inverse depth of points off the ground, in camera heights: a wall stands half a height to infinitely far away.
-_INVERSE_DEPTH = 0.5
+_WALK = 0.8  # heights a second ahead: where the fit begins
+#: Inverse depth of points off the ground, in camera heights: a wall stands one height to infinitely far away.
+_INVERSE_DEPTH = 1.0
 #: Neighbouring flow vectors share their errors; so many count as one.
 _SHARED = 16.0
 #: Smallest deviation of flow, in focal lengths a frame: what DIS rounds to.
 _LEAST = 2e-4
+#: The rounds begin with a wide scale along the motion, and narrow it by this factor.
+_ANNEAL = 0.6
 _ROUNDS = 8
 _BATCH = 256  # frames at a time
 
@@ -112,7 +115,9 @@ def _fit(
     right[:, 3], right[:, 4], right[:, 5] = -depth, 0.0, depth * x
     below[:, 3], below[:, 4], below[:, 5] = 0.0, -depth, depth * y
     wanted, first = moved, 0
+    # Beginning with a walk, points off the ground do not pull the turn in the first rounds.
     fitted = np.zeros((count, 6))
+    fitted[:, 3:] = _WALK / fps * axes[:, 0]
     if known is not None:
         fitted[:, :3] = known
         wanted = moved - np.stack([np.einsum("ti,tip->tp", known, j[:, :3]) for j in (right, below)], 1)
@@ -138,21 +143,23 @@ def _reweighted(
     tiny = 1e-12 * np.eye(right.shape[1])
     normal, weight = prior, np.ones_like(floor, dtype=np.float64)
     square = np.full(len(moved), (10 * _LEAST) ** 2)
-    for _ in range(_ROUNDS):
+    for number in range(_ROUNDS):
         velocity, own = fitted[:, 3:], fitted[:, first:]
         error_right = moved[:, 0] - np.einsum("ti,tip->tp", own, right)
         error_below = moved[:, 1] - np.einsum("ti,tip->tp", own, below)
-        # The first round has no velocity yet, and any direction will do.
         along_right = 1e-9 - velocity[:, :1] + x * velocity[:, 2:]
         along_below = -velocity[:, 1:2] + y * velocity[:, 2:]
         speed = np.maximum(np.hypot(along_right, along_below), 1e-12)
         cos, sin = along_right / speed, along_below / speed
         along, across = error_right * cos + error_below * sin, error_below * cos - error_right * sin
-        seen = np.where(floor, np.hypot(along, across), np.abs(across))
-        square = (1.48 * np.median(seen, axis=1) + _LEAST) ** 2
+        # Across, no depth disturbs the flow: what is left there is its noise.
+        square = (1.48 * np.median(np.abs(across), axis=1) + _LEAST) ** 2
         one = square[:, None]
-        wide = np.where(floor, one, one + (_INVERSE_DEPTH * speed) ** 2)
-        weight = 1.0 / (1.0 + along**2 / wide + across**2 / one)
+        coarse = 1.48 * _ANNEAL**number * np.median(np.where(floor, np.abs(along), np.abs(across)), axis=1)
+        wide = np.maximum(one, coarse[:, None] ** 2)
+        spread = np.where(floor, wide, one + (_INVERSE_DEPTH * speed) ** 2)
+        weight = 1.0 / (1.0 + along**2 / spread + across**2 / one)
+        wide = np.where(floor, one, spread)
         first_rows, second_rows = right * cos[:, None] + below * sin[:, None], below * cos[:, None] - right * sin[:, None]
         first_weight, second_weight = weight * one / wide, weight
         first_moved, second_moved = moved[:, 0] * cos + moved[:, 1] * sin, moved[:, 1] * cos - moved[:, 0] * sin

@@ -20,13 +20,13 @@ from egopose.vision.ground_motion import GroundMotion, fit_ground_motion, gravit
 
 #: s, standard deviation of the Gaussian that steadies the vertical: nodding stays in the signal.
 _STEADY = 4.0 / 30.0
-#: s over which a tilt without an instrument returns to the camera's mean tilt: longer than a look at one's feet.
-_TILT_MEMORY = 2.0
+#: s over which a tilt without an instrument returns to the mean: long enough for the nodding of steps, too short to drift.
+_TILT_MEMORY = 0.3
 #: Heights a second and rad/s: numbers this uncertain have half of the quality.
 _DOUBTFUL_VELOCITY, _DOUBTFUL_TURN = 0.1, 0.1
 #: The share of the floor's points that move as a floor does, below which the velocity has no quality, and above which
 #: it has all of it. Cauchy's weights of normal errors have a mean of 0.56.
-_NO_FLOOR, _FLOOR = 0.25, 0.45
+_NO_FLOOR, _FLOOR = 0.05, 0.30
 #: Cells across the picture in which flow is fitted; more cost time and do not help.
 _CELLS = 24
 #: rad, the pitches among which a film's is looked for, and what is taken where nobody walks.
@@ -185,7 +185,7 @@ def _cross(d: Array) -> Array:
 def down_from_turning(turn: Array, pitch_down: float, fps: float) -> Array:
     """Unit vectors down ``[T, 3]`` of a camera that turns ``[T, 3]`` (rad a frame) and has that mean pitch (rad).
 
-    The turns are integrated, and the result returns to the mean tilt within two seconds: people hold their heads so,
+    The turns are integrated, and the result returns to the mean tilt at once: people hold their heads so,
     and errors do not add up.
     """
     usual = down_of(pitch_down, 0.0)
