@@ -8,6 +8,7 @@ mean action is where planning begins, and V(s_t) is what the best plan is worth.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -92,6 +93,7 @@ def estimate_takes(
     lookahead: int | None = None,
     counterfactuals: CounterfactualRollouts | None = None,
     planner: Planner | None = None,
+    watch: Callable[[Array], None] | None = None,
 ) -> list[Estimate]:
     """Run every world's fragment from its first frame to its last.
 
@@ -107,6 +109,7 @@ def estimate_takes(
             come with the observation are the caller's.
         counterfactuals: is told the states in which the fail-safe triggered.
         planner: of as many bodies; None for the policy alone.
+        watch: is shown the bodies ``[N, nq]`` of each frame as soon as they are known.
 
     Returns:
         One :class:`Estimate` a world; fragments may differ in length.
@@ -137,6 +140,8 @@ def estimate_takes(
             frame = (body["qpos"], value, triggered, placed, observation["fallen"].squeeze(-1), diverged)
             for name, column in zip(rows, frame, strict=True):
                 rows[name].append(column)
+            if watch is not None:
+                watch(body["qpos"].numpy())
             if counterfactuals is not None and triggered.any():
                 counterfactuals.keep(base, observation, triggered.nonzero().squeeze(-1))
             if t + 1 == int(lengths.max()):
