@@ -41,7 +41,8 @@ from egopose.pipeline.regressor_input import (
 )
 from egopose.training import blended_regressor as blending
 from egopose.training.blended_regressor import KernelSettings
-from egopose.vision.body_parts import BodyPartEstimator, as_plane, body_part_rows, small_picture
+from egopose.vision.body_parts import BodyPartEstimator, as_plane, body_part_rows
+from egopose.vision.film import small_picture
 from egopose.vision.encoders import LightFlowEncoder
 from egopose.vision.features import extract_body_parts, extract_flow
 from egopose.vision.flow import FlowConfig

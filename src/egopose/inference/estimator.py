@@ -9,6 +9,7 @@ planner, the mean action is where planning begins, and V(s_t) is what the best p
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -96,6 +97,7 @@ def estimate_takes(
     counterfactuals: CounterfactualRollouts | None = None,
     planner: Planner | None = None,
     restart: FollowedPath | None = None,
+    watch: Callable[[Array], None] | None = None,
 ) -> list[Estimate]:
     """Run every world's fragment from its first frame to its last.
 
@@ -113,6 +115,7 @@ def estimate_takes(
         planner: of as many bodies; None for the policy alone.
         restart: the path at whose place and heading bodies restart, with a row for every global frame; the planner's
             own, where there is a planner. None: they restart at their own.
+        watch: is shown the bodies ``[N, nq]`` of each frame as soon as they are known.
 
     Returns:
         One :class:`Estimate` a world; fragments may differ in length.
@@ -145,6 +148,8 @@ def estimate_takes(
             frame = (body["qpos"], value, triggered, placed, observation["fallen"].squeeze(-1), diverged)
             for name, column in zip(rows, frame, strict=True):
                 rows[name].append(column)
+            if watch is not None:
+                watch(body["qpos"].numpy())
             if counterfactuals is not None and triggered.any():
                 counterfactuals.keep(base, observation, triggered.nonzero().squeeze(-1))
             if t + 1 == int(lengths.max()):

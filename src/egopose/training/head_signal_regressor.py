@@ -236,9 +236,7 @@ def train_head_signal_regressor(
         mirror = state_mirror(humanoid.skeleton)
         weights = torch.tensor([float(len(example.states)) for example in pool])
         steps = max(1, int(weights.sum() / settings.variants / settings.length / settings.batch))
-        optimiser = torch.optim.AdamW(
-            model.parameters(), lr=settings.learning_rate, weight_decay=settings.weight_decay
-        )
+        optimiser = torch.optim.AdamW(model.parameters(), lr=settings.learning_rate, weight_decay=settings.weight_decay)
         schedule = torch.optim.lr_scheduler.OneCycleLR(
             optimiser, settings.learning_rate, total_steps=steps * settings.epochs, pct_start=0.15
         )

@@ -160,7 +160,10 @@ def _reweighted(
         spread = np.where(floor, wide, one + (_INVERSE_DEPTH * speed) ** 2)
         weight = 1.0 / (1.0 + along**2 / spread + across**2 / one)
         wide = np.where(floor, one, spread)
-        first_rows, second_rows = right * cos[:, None] + below * sin[:, None], below * cos[:, None] - right * sin[:, None]
+        first_rows, second_rows = (
+            right * cos[:, None] + below * sin[:, None],
+            below * cos[:, None] - right * sin[:, None],
+        )
         first_weight, second_weight = weight * one / wide, weight
         first_moved, second_moved = moved[:, 0] * cos + moved[:, 1] * sin, moved[:, 1] * cos - moved[:, 0] * sin
         first_weighted, second_weighted = first_rows * first_weight[:, None], second_rows * second_weight[:, None]

@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from egopose.models.regressor import StateRegressor
-from egopose.vision.body_parts import PICTURE, BodyPartEstimator, Picture, as_plane, pair_rows, small_picture
+from egopose.vision.body_parts import BodyPartEstimator, Picture, as_plane, pair_rows
+from egopose.vision.film import PICTURE, small_picture
 from egopose.vision.flow import FlowConfig, FlowEstimator, grey_square
 from egopose.vision.lens import Camera, undo_rolling_shutter
 from egopose.vision.video import Frame
