@@ -12,6 +12,7 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from torch import Tensor
 from torchrl.envs import TransformedEnv
+from torchrl.modules import ValueOperator
 
 from egopose.collection.lazy_rewards import GaussianSampler, draws_otherwise
 from egopose.collection.stepping import Entries, TransformedEgoPoseEnv, parts_of, run_parts
@@ -87,7 +88,8 @@ def runs_quickly(actor: Controller, critic: Controller) -> bool:
     if draws_otherwise(actor) is not None or GaussianSampler(actor).needs_tensordicts() is not None:
         return False
     plain = [
-        type(part) is TensorDictModule and all(isinstance(key, str) for key in (*part.in_keys, *part.out_keys))
+        type(part) in (TensorDictModule, ValueOperator)
+        and all(isinstance(key, str) for key in (*part.in_keys, *part.out_keys))
         for part in parts_of(critic)
     ]
     return all(plain)
