@@ -7,6 +7,7 @@ scaling: the cost of every part of an iteration, and the memory of workers that 
 sync: the accuracy of offsets between motions and videos.
 stream: live estimation: frames a second, latency by stage, late frames, memory.
 plan: the planner at test time beside its bare physics.
+estimate: the command `egopose estimate` on a film, beside the film's own length.
 resume: a training killed at random moments beside the same one left alone.
 retarget: frames a second of retargeting to the humanoid, on one core.
 export: what every export format loses, by independent readers.

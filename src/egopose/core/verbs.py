@@ -34,4 +34,5 @@ BENCHMARKS = {
     "sync": 8,
     "stream": 1,
     "plan": 9,
+    "estimate": 3,
 }

@@ -87,9 +87,8 @@ def runs_quickly(actor: Controller, critic: Controller) -> bool:
         return False
     if draws_otherwise(actor) is not None or GaussianSampler(actor).needs_tensordicts() is not None:
         return False
-    plain = [
-        type(part) in (TensorDictModule, ValueOperator)
-        and all(isinstance(key, str) for key in (*part.in_keys, *part.out_keys))
-        for part in parts_of(critic)
-    ]
-    return all(plain)
+    parts = parts_of(critic)
+    keys = [key for part in parts for key in (*part.in_keys, *part.out_keys)]
+    return all(type(part) in (TensorDictModule, ValueOperator) for part in parts) and all(
+        isinstance(key, str) for key in keys
+    )
