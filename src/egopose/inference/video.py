@@ -41,7 +41,7 @@ from egopose.vision.video import probe_video
 
 READING, SEEING, MOVING, DRAWING = "reading the film", "seeing the pose", "moving the body", "drawing"
 #: What a frame costs in each stage beside the others, without and with a planner (measured, docs/performance.md).
-_COSTS, _PLANNED = {READING: 5.0, SEEING: 0.3, MOVING: 4.0, DRAWING: 5.0}, {MOVING: 250.0, DRAWING: 0.3}
+_COSTS, _PLANNED = {READING: 5.0, SEEING: 0.3, MOVING: 4.0, DRAWING: 5.0}, {MOVING: 170.0, DRAWING: 0.3}
 
 
 def run_estimate(
