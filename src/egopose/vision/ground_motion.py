@@ -13,6 +13,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from egopose.motion.rotations import Array
 
@@ -82,7 +83,7 @@ def fit_ground_motion(moved: Array, rays: Array, down: Array, fps: float, turn: 
     """Turn and velocity of every frame.
 
     Args:
-        moved: ``[T, 2, P]`` flow in focal lengths a frame, right and down, at ``rays``.
+        moved: ``[T, 2, P]`` flow in focal lengths a frame, right and down, at ``rays``. NaN counts for nothing.
         rays: ``[2, P]``, see :func:`pixel_rays`.
         down: ``[T, 3]`` unit vectors down in the camera's axes.
         fps: frames/s, for the prior of velocities.
@@ -103,8 +104,10 @@ def _fit(
     moved: Array, rays: Array, down: Array, fps: float, known: Array | None
 ) -> tuple[Array, Array, Array, Array, Array, Array]:
     x, y = rays
+    shown = np.asarray(np.isfinite(moved).all(1))
+    moved = np.where(shown[:, None], moved, 0.0)
     depth = x * down[:, :1] + y * down[:, 1:2] + down[:, 2:]
-    floor = depth > np.sin(_BELOW) * np.sqrt(1 + x * x + y * y)
+    floor = np.asarray(shown & (depth > np.sin(_BELOW) * np.sqrt(1 + x * x + y * y)))
     depth = np.where(floor, depth, 0.0)
     count, pixels = depth.shape
     axes = gravity_axes(down)
@@ -122,7 +125,7 @@ def _fit(
         fitted[:, :3] = known
         wanted = moved - np.stack([np.einsum("ti,tip->tp", known, j[:, :3]) for j in (right, below)], 1)
         right, below, prior, first = right[:, 3:], below[:, 3:], prior[:, 3:, 3:], 3
-    normal, weight, square = _reweighted(wanted, right, below, floor, prior, rays, fitted, first)
+    normal, weight, square = _reweighted(wanted, right, below, shown, floor, prior, rays, fitted, first)
     spread = np.linalg.inv(normal) * (square * _SHARED)[:, None, None]
     variances = np.diagonal(spread, axis1=1, axis2=2)
     share = (weight * floor).sum(1) / np.maximum(floor.sum(1), 1)
@@ -132,7 +135,15 @@ def _fit(
 
 
 def _reweighted(
-    moved: Array, right: Array, below: Array, floor: Array, prior: Array, rays: Array, fitted: Array, first: int
+    moved: Array,
+    right: Array,
+    below: Array,
+    shown: NDArray[np.bool_],
+    floor: NDArray[np.bool_],
+    prior: Array,
+    rays: Array,
+    fitted: Array,
+    first: int,
 ) -> tuple[Array, Array, Array]:
     """Fill ``fitted [T, 6]`` from column ``first`` on; returns the normal matrix, weights ``[T, P]`` and variances.
 
@@ -153,12 +164,13 @@ def _reweighted(
         cos, sin = along_right / speed, along_below / speed
         along, across = error_right * cos + error_below * sin, error_below * cos - error_right * sin
         # Across, no depth disturbs the flow: what is left there is its noise.
-        square = (1.48 * np.median(np.abs(across), axis=1) + _LEAST) ** 2
+        square = (1.48 * _median(np.abs(across), shown) + _LEAST) ** 2
         one = square[:, None]
-        coarse = 1.48 * _ANNEAL**number * np.median(np.where(floor, np.abs(along), np.abs(across)), axis=1)
+        off = np.where(floor, np.abs(along), np.abs(across))
+        coarse = 1.48 * _ANNEAL**number * _median(off, shown)
         wide = np.maximum(one, coarse[:, None] ** 2)
         spread = np.where(floor, wide, one + (_INVERSE_DEPTH * speed) ** 2)
-        weight = 1.0 / (1.0 + along**2 / spread + across**2 / one)
+        weight = shown / (1.0 + along**2 / spread + across**2 / one)
         wide = np.where(floor, one, spread)
         first_rows, second_rows = (
             right * cos[:, None] + below * sin[:, None],
@@ -172,3 +184,11 @@ def _reweighted(
         target = first_weighted @ first_moved[..., None] + second_weighted @ second_moved[..., None]
         fitted[:, first:] = np.linalg.solve(normal, target)[..., 0]
     return normal, weight, square
+
+
+def _median(values: Array, shown: NDArray[np.bool_]) -> Array:
+    """``[T]`` medians of ``values [T, P]`` where ``shown``; 0 where nothing is."""
+    ordered = np.sort(np.where(shown, values, np.inf), axis=1)
+    count = shown.sum(1)
+    middle = ordered[np.arange(len(values)), np.maximum(count - 1, 0) // 2]
+    return np.where(count > 0, middle, 0.0)
