@@ -22,6 +22,10 @@ _PAYLOAD = 1.001
 _COEFFICIENTS = ("POLY", "ZMPL", "ARUW", "ARWA")
 #: A picture turned by less than this (rad) against the camera is not steadied: ten steps of the stored numbers.
 _UNTURNED = 1e-3
+#: The streams of numbers that are read.
+_STREAMS = frozenset(("GYRO", "ACCL", "GRAV", "CORI", "IORI", "GPS5", "GPS9", "SROT", "MSKP", "LSKP", "SHUT", "ISOE"))
+#: Samples of one stream: Fusion's 3200 Hz for an hour and a half.
+_MAX_SAMPLES = 2**24
 #: s: slower than any sensor that rolls.
 _MOST_READOUT = 0.1
 
@@ -82,8 +86,13 @@ def _telemetry(path: str | PathLike[str], track: Track) -> Telemetry:
             return None
         if any(b.values.shape[1] < columns for b in blocks):
             raise InputError(path, key, f"{blocks[0].values.shape[1]} numbers a sample; expected {columns}")
+        count = sum(b.count for b in blocks)
+        if count > _MAX_SAMPLES:
+            raise InputError(path, key, f"{count} samples; at most {_MAX_SAMPLES} are read")
         values = np.concatenate([b.values[:, :columns] for b in blocks])
         times = sample_times(blocks, track.starts, track.durations, frame)
+        if not (np.isfinite(times).all() and (np.diff(times) > 0).all()):
+            raise InputError(path, key, "is damaged: the times of its samples do not rise")
         good = np.isfinite(values).all(axis=1)
         return Samples(times[good], values[good])
 
@@ -150,7 +159,7 @@ def _streams(
                 if stream.key != "STRM" or not stream.inner:
                     continue
                 *about, last = stream.inner
-                if owner.setdefault(last.key, identity) != identity:
+                if last.key not in _STREAMS or owner.setdefault(last.key, identity) != identity:
                     continue
                 described = {e.key: e for e in about}
                 block = _block(path, number, described, last)
@@ -171,7 +180,8 @@ def _block(path: str | PathLike[str], number: int, about: dict[str, Entry], last
         if divisor.size not in (1, values.shape[1]) or not (np.isfinite(divisor) & (divisor != 0)).all():
             cause = f"SCAL has {divisor.size} numbers for {values.shape[1]}, or a zero"
             raise InputError(path, f"telemetry payload {number + 1}: {_plain(last.key)}", cause)
-        values = values / divisor
+        with np.errstate(over="ignore"):  # what is too large is not finite, and left out
+            values = values / divisor
     stamp = about["STMP"].numbers() if "STMP" in about else None
     total = about["TSMP"].numbers() if "TSMP" in about else None
     return Block(
@@ -179,7 +189,7 @@ def _block(path: str | PathLike[str], number: int, about: dict[str, Entry], last
         len(values),
         values,
         None if stamp is None or not stamp.size else float(stamp.flat[0]) / 1e6,
-        None if total is None or not total.size else int(total.flat[0]),
+        None if total is None or not total.size or not np.isfinite(total.flat[0]) else int(total.flat[0]),
     )
 
 

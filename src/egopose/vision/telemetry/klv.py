@@ -39,8 +39,9 @@ class Entry:
     inner: tuple[Entry, ...] = ()
 
     def text(self) -> str:
-        """Characters up to the first zero."""
-        return self.body.split(b"\0")[0].decode("latin1").strip()
+        """Printable characters up to the first zero, 255 at most."""
+        told = self.body[:255].split(b"\0")[0].decode("latin1")
+        return "".join(c for c in told if c.isprintable()).strip()
 
     def numbers(self, complex_type: str | None = None) -> Array | None:
         """``[count, columns]``, or None where the entry holds no numbers.
@@ -55,11 +56,12 @@ class Entry:
             item = np.dtype(_NUMBERS[kinds])
             if not self.size or self.size % item.itemsize:
                 return None
-            return np.frombuffer(self.body, item).reshape(self.count, -1).astype(np.float64)
+            shape = (self.count, self.size // item.itemsize)
+            return np.frombuffer(self.body, item).reshape(shape).astype(np.float64) if self.count else np.zeros(shape)
         row = np.dtype([(f"f{i}", _NUMBERS[kind]) for i, kind in enumerate(kinds)])
         if row.itemsize != self.size:
             return None
-        table = np.frombuffer(self.body, row)
+        table = np.frombuffer(self.body, row) if self.count else np.zeros(0, row)
         return np.stack([table[name].astype(np.float64) for name in row.names or ()], axis=1)
 
 

@@ -221,7 +221,7 @@ def _faulty(path: str | PathLike[str], names: Sequence[str], said: str) -> Input
         name = names[column] if column < len(names) else f"column {column + 1}"
         return InputError(path, name, f"row {int(cell[2]) + 2}: no number: {cell[1].rstrip(chr(39))}'")
     if short := re.search(r"at row (\d+) with (\d+) columns", said):
-        return InputError(path, f"row {int(short[1]) + 2}", f"{short[2]} columns; the header has {len(names)}")
+        return InputError(path, f"row {int(short[1]) + 1}", f"{short[2]} columns; the header has {len(names)}")
     return InputError(path, "rows", f"cannot be read: {' '.join(said.split())}"[:200])
 
 

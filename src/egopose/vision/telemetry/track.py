@@ -16,7 +16,7 @@ from egopose.vision.containers import boxes, inside_box
 #: Payloads of a file: one a second, so a day.
 MAX_PAYLOADS = 86_400
 #: Bytes of all payloads together: a HERO11 takes 7 kB/s, a Fusion 24.
-MAX_TELEMETRY_BYTES = 256 * 2**20
+MAX_TELEMETRY_BYTES = 128 * 2**20
 _MAX_SETTINGS_BYTES = 2**20
 
 
@@ -115,11 +115,10 @@ def _tables(
         raise InputError(path, "telemetry track", cause)
     scale = _time_scale(path, stream, track)
     runs = _numbers(path, stream, table, b"stts", 2)
-    if (runs[:, 0] > count).any():
-        raise InputError(path, "box stts", f"is damaged: times of more payloads than the {count} there are")
-    ticks = np.repeat(runs[:, 1], runs[:, 0])[:count] if len(runs) else np.zeros(0, np.int64)
-    if len(ticks) < count:
-        raise InputError(path, "box stts", f"is damaged: times of {len(ticks)} of {count} payloads")
+    # Counted before they are laid out: a few rows can announce more than fits any memory.
+    if runs[:, 0].sum() != count:
+        raise InputError(path, "box stts", f"is damaged: times of {runs[:, 0].sum()} payloads, not of {count}")
+    ticks = np.repeat(runs[:, 1], runs[:, 0])
     durations = ticks / scale
     starts = np.concatenate([np.zeros(1), np.cumsum(durations)])[:count]
     return starts, durations, np.stack([_offsets(path, stream, table, lengths), lengths], axis=1)
@@ -141,7 +140,8 @@ def _offsets(
     held = np.repeat(per, np.diff(np.append(first, len(chunks))))
     if held.sum() < len(lengths):
         raise InputError(path, "box stsc", f"is damaged: chunks of {held.sum()} of {len(lengths)} payloads")
-    chunk = np.repeat(np.arange(len(chunks)), held)[: len(lengths)]
+    used = int(np.searchsorted(np.cumsum(held), len(lengths))) + 1
+    chunk = np.repeat(np.arange(used), held[:used])[: len(lengths)]
     before = np.cumsum(lengths) - lengths
     begins = np.flatnonzero(np.diff(chunk, prepend=-1))
     return chunks[chunk] + before - before[begins][chunk]

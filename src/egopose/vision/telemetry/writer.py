@@ -102,16 +102,14 @@ def _index(video: Path, stream: BinaryIO, size: int) -> tuple[int, int]:
 
 def _video_track(video: Path, stream: BinaryIO, index: tuple[int, int]) -> tuple[int, float, float]:
     """Frames, width and height of the video."""
-    for kind, body, stop in boxes(stream, *index):
-        if kind == b"trak" and is_telemetry(stream, (body, stop)):
-            raise InputError(video, "telemetry track", "is there already")
-        if kind == b"trak" and (seen := picture_size(stream, (body, stop))) is not None:
-            place = inside_box(stream, body, stop, b"mdia", b"minf", b"stbl", b"stsz")
-            raw = b""
-            if place is not None:
-                stream.seek(place[0] + 8)
-                raw = stream.read(4)
-            frames = int.from_bytes(raw, "big")
+    tracks = [(body, stop) for kind, body, stop in boxes(stream, *index) if kind == b"trak"]
+    if any(is_telemetry(stream, track) for track in tracks):
+        raise InputError(video, "telemetry track", "is there already")
+    for track in tracks:
+        seen, place = picture_size(stream, track), inside_box(stream, *track, b"mdia", b"minf", b"stbl", b"stsz")
+        if seen is not None and place is not None:
+            stream.seek(place[0] + 8)
+            frames = int.from_bytes(stream.read(4), "big")
             if not 0 < frames <= _MAX_FRAMES:
                 raise InputError(video, "frames", f"{frames} in the index; 1 to {_MAX_FRAMES}")
             return frames, *seen
