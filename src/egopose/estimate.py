@@ -8,6 +8,7 @@ from omegaconf import DictConfig
 
 from egopose.core.config import command, resolved
 from egopose.core.errors import InputError
+from egopose.core.runtime import libraries_loading
 
 
 @command("estimate")
@@ -20,7 +21,8 @@ def main(config: DictConfig) -> None:
         # Another process reads the film while this one imports torch and what stands on it.
         film = foreseen_film(values)
 
-        from egopose.inference.video import estimate_video
+        with libraries_loading():
+            from egopose.inference.video import estimate_video
 
         estimate_video(values, film)
     except InputError as error:

@@ -24,6 +24,7 @@ from egopose.envs.env import EgoPoseEnv
 from egopose.envs.test_time import Controller, prepare_for_test
 from egopose.humanoid.foot_geometry import out_of_floor
 from egopose.humanoid.model import HumanoidModel
+from egopose.inference.acting import Acting, acting
 from egopose.inference.counterfactuals import CounterfactualRollouts
 from egopose.inference.failsafe import FailSafe
 from egopose.inference.followed_path import FollowedPath
@@ -128,7 +129,9 @@ def estimate_takes(
     lengths = stop - start
     worlds = torch.arange(len(start))
     _restart(base, worlds, states[start], base.body_state()["qpos"])
-    observation = env.transform(base.observe())
+    # Counterfactuals take rows of TensorDicts.
+    body_acts = acting(env, actor, critic) if counterfactuals is None else Acting(env, actor, critic)
+    observation = body_acts.observed()
 
     rows: dict[str, list[Tensor]] = {
         name: [] for name in ("qpos", "value", "triggered", "resets", "fallen", "diverged")
@@ -139,7 +142,7 @@ def estimate_takes(
             body = base.body_state()
             if restart is not None and planner is None:  # a planner moves its path on by itself
                 restart.advance(base.frame, body["qpos"])
-            observation = critic(actor(observation))
+            observation = body_acts.act(observation)
             value = observation["state_value"].squeeze(-1)
             if planner is not None:
                 observation["action"] = observation["action"] + planner.perturbation(base)
@@ -154,8 +157,8 @@ def estimate_takes(
                 counterfactuals.keep(base, observation, triggered.nonzero().squeeze(-1))
             if t + 1 == int(lengths.max()):
                 break
-            after = env.step(observation)["next"]
-            diverged = after["diverged"].squeeze(-1)
+            observation = body_acts.step(observation)
+            diverged = observation["diverged"].squeeze(-1)
             placed = (triggered | diverged) & (t + 1 < lengths)
             again = placed.nonzero().squeeze(-1)
             if len(again):
@@ -165,8 +168,7 @@ def estimate_takes(
                 _restart(base, again, states[start[again] + t + 1], where)
                 if planner is not None:
                     planner.forget(again)
-                after = env.transform(base.observe())
-            observation = after.exclude("reward", "action")
+                observation = body_acts.observed()
     table = {name: torch.stack(column, dim=1).numpy() for name, column in rows.items()}
     confidence = torch.stack(guard.confidence, dim=1).numpy()
     return [

@@ -14,6 +14,7 @@ from egopose.checkpoint.checkpoint import find_checkpoint, read_json
 from egopose.core.config import from_mapping
 from egopose.core.errors import InputError
 from egopose.core.result_files import write_columns_csv
+from egopose.core.runtime import settle_heap
 from egopose.data.preparation import humanoid_of
 from egopose.inference.estimator import estimate_takes, restart_path
 from egopose.inference.failsafe import FailSafe, FailSafeSettings
@@ -84,6 +85,7 @@ def run_estimate(
     known = {"PoseReg": pose_motion.qpos}
     film.draw(Drawing(out / "side_by_side.mp4", humanoid.mj_model, "estimate", known, seen.label))
     restart = restart_path(failsafe.restart, env, planner)
+    settle_heap()
     with progress.stage(MOVING) as advance:
 
         def watch(qpos: Array) -> None:
