@@ -43,9 +43,9 @@ def _load(folder: Path) -> tuple[StateRegressor, list[str]]:
     config = read_json(folder, "config")
     size = int(config["state_size"])
     hidden = tuple(int(width) for width in config["hidden"])
-    model = StateRegressor(
-        None, torch.zeros(size), torch.ones(size), SIGNAL_FEATURES, int(config["context_size"]), hidden
-    )
+    zeros, ones, context = torch.zeros(size), torch.ones(size), int(config["context_size"])
+    # Dropout does nothing in evaluation, but its layers count in the names of those behind it.
+    model = StateRegressor(None, zeros, ones, SIGNAL_FEATURES, context, hidden, float(config["dropout"]))
     RunCheckpoint({"regressor": model}).restore(folder, {"regressor"})
     return model.eval(), [str(name) for name in config["skeleton"]]
 
@@ -56,7 +56,7 @@ def save_head_signal_regressor(model: StateRegressor, humanoid: HumanoidModel, s
     Args:
         model: trained.
         humanoid: whose states it gives.
-        settings: a dataclass with ``context_size`` and ``hidden``, kept as it is.
+        settings: a dataclass with ``context_size``, ``hidden`` and ``dropout``, kept as it is.
         folder: to be written.
     """
     size = len(model.state_mean)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -41,7 +42,7 @@ class FilmReading:
 
 @torch.no_grad()
 def read_states(
-    humanoid: HumanoidModel, rows: Sequence[HeadRow], video: str, camera: Camera, worn: WornCamera
+    humanoid: HumanoidModel, rows: Sequence[HeadRow], video: Path, camera: Camera, worn: WornCamera
 ) -> FilmReading:
     """States and signal of a film's rows.
 

@@ -20,7 +20,7 @@ from egopose.vision.head_signal import HeadSignal
 from egopose.vision.mounts import camera_poses, mount_of
 
 #: s, standard deviation of the Gaussian that parts slow from quick. Steps are quicker; a glance aside takes a second.
-_SLOW_TURN, _SLOW_MOVE = 1.0, 0.7
+_SLOW_TURN, _SLOW_MOVE = 0.6, 0.7
 # Below the first number nothing moves, above the second all of it counts: m/s, and rad/s (2 and 5 degrees/s). Errors of
 # a standing person's signal lie below.
 _STANDS, _STANDING_TURN = (0.06, 0.14), (0.035, 0.09)

@@ -180,7 +180,7 @@ def head_rows(
 
 
 def _cells(dense: NDArray[np.floating], shown: NDArray[np.bool_] | None) -> NDArray[np.float32]:
-    """Dense flow ``[H, W, 2]`` in pixels -> means of cells ``[2, h, w]`` in picture widths; NaN where not all is shown."""
+    """Dense flow ``[H, W, 2]`` in pixels -> means of cells ``[2, h, w]`` in widths; NaN where not all is shown."""
     height, width = dense.shape[:2]
     size = (_CELLS, max(round(_CELLS * height / width), 2))
     mean = cv2.resize(np.asarray(dense, np.float32), size, interpolation=cv2.INTER_AREA) / width

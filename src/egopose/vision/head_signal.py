@@ -51,7 +51,7 @@ class HeadSignal:
         turning: ``[T, 3]`` rad/s about the axes ahead, left, up.
         velocity: ``[T, 3]`` camera heights a second ahead, left, up.
         tilt: ``[T, 2]`` rad: how far the camera looks below the horizon, and its roll; steadied.
-        quality: ``[T, 2]`` in 0..1, of turning and of velocity.
+        quality: ``[T, 3]`` in 0..1: of turning, of velocity, and the share of the picture that one camera explains.
     """
 
     turning: Array
@@ -63,8 +63,8 @@ class HeadSignal:
         return len(self.turning)
 
     def numbers(self) -> Array:
-        """``[T, 10]``: turning, velocity, tilt and quality side by side, as a regressor reads them."""
-        return np.concatenate([self.turning, self.velocity, self.tilt, self.quality], axis=1)
+        """``[T, 10]``: turning, velocity, tilt and their two qualities side by side, as a regressor reads them."""
+        return np.concatenate([self.turning, self.velocity, self.tilt, self.quality[:, :2]], axis=1)
 
 
 def tilt_of(down: Array) -> Array:
@@ -98,7 +98,7 @@ def signal_of_motion(positions: Array, rotations: Array, fps: float) -> HeadSign
     turn[1:] = Rotation.from_matrix(np.swapaxes(rotations[:-1], 1, 2) @ rotations[1:]).as_rotvec() * fps
     step[1:] = np.diff(positions, axis=0) * fps / np.maximum(positions[1:, 2:], 0.2)
     velocity = np.einsum("tji,tj->ti", rotations, step)
-    quality = np.ones((len(positions), 2))
+    quality = np.ones((len(positions), 3))
     quality[:1] = 0.0
     return HeadSignal(_in(axes, turn), _in(axes, velocity), tilt_of(down), quality)
 
@@ -144,7 +144,7 @@ def signal_of_flow(
             turn = without_bias(turning * seconds, fit, known)
             fit = fit_ground_motion(moved, rays, down, fps, turn)
     axes = gravity_axes(steadied(down, fps))
-    quality = np.stack([turn_quality, velocity_quality(fit, fps)], axis=1)
+    quality = np.stack([turn_quality, velocity_quality(fit, fps), fit.rigid], axis=1)
     quality[:1] = 0.0
     tilt = tilt_of(steadied(down, fps))
     return HeadSignal(_in(axes, turn) / seconds, _in(axes, fit.velocity) / seconds, tilt, quality)
