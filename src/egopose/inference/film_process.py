@@ -26,6 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from egopose.checkpoint.pretrained import is_pretrained, pretrained_run
+from egopose.core.config import from_mapping
 from egopose.core.errors import InputError
 from egopose.core.former_names import upgraded
 from egopose.core.runtime import end_with_parent
@@ -34,6 +35,7 @@ from egopose.motion.rotations import Array
 from egopose.vision.film import FilmRow, film_rows
 from egopose.vision.flow import FlowConfig
 from egopose.vision.gl import choose_backend
+from egopose.vision.head_film import HeadRow, WornCamera, film_camera, head_rows, telemetry_of
 from egopose.vision.lens import Camera
 from egopose.vision.side_by_side import middle_square, side_by_side
 from egopose.vision.video import Frame, probe_video, write_video
@@ -43,6 +45,8 @@ _FRAMES = 16
 _JPEG = [cv2.IMWRITE_JPEG_QUALITY, 95]
 _AHEAD = 8  # frames whose panels may wait for their thread
 _STOP = "stop"
+#: What a video can be seen by: the run's own regressor of flow, or the head signal.
+SEES = ("auto", "flow", "head_signal")
 
 Advance = Callable[[int], None]
 """Is told how many more frames are done."""
@@ -60,6 +64,7 @@ class FilmSettings:
         camera: that took it.
         pictures: whether the body-part estimator's small pictures are wanted.
         panel: side of the wearer's panel, pixels.
+        worn: how the camera is worn, if the head signal is read; None reads flow in a square.
     """
 
     video: Path
@@ -69,6 +74,7 @@ class FilmSettings:
     camera: Camera
     pictures: bool
     panel: int
+    worn: WornCamera | None = None
 
     @classmethod
     def of(cls, values: Mapping[str, Any], source: Mapping[str, Any], fps: float) -> FilmSettings:
@@ -79,10 +85,39 @@ class FilmSettings:
         """
         camera = Camera.from_mapping(values["camera"], "camera")
         kernel = source["regressor"].get("kernel") or {}
-        flow, pictures = FlowConfig(**source["vision"]["flow"]), kernel.get("body_parts") is not None
-        return cls(
-            Path(str(values["video"])), flow, fps, float(values["offset"]), camera, pictures, int(values["size"])
-        )
+        worn = worn_camera(values)
+        flow, pictures = FlowConfig(**source["vision"]["flow"]), kernel.get("body_parts") is not None and worn is None
+        video, offset = Path(str(values["video"])), float(values["offset"])
+        return cls(video, flow, fps, offset, camera, pictures, int(values["size"]), worn)
+
+
+def worn_camera(values: Mapping[str, Any]) -> WornCamera | None:
+    """How the camera of ``conf/estimate.yaml`` (resolved) is worn, if its head signal is to be read.
+
+    ``sees: auto`` reads it of a film. A video that this project rendered has a record beside it, and is seen by the
+    run's own regressor, as is every video live (``causal``).
+
+    Raises:
+        InputError: a setting that cannot be.
+    """
+    worn = from_mapping(WornCamera, values["worn"], "conf/estimate.yaml: worn")
+    sees = values["sees"]
+    if sees not in SEES:
+        raise InputError("conf/estimate.yaml", "sees", f"must be one of {', '.join(SEES)}, not {sees!r}")
+    if sees == "auto":
+        sees = "flow" if values["causal"] or was_rendered(Path(str(values["video"]))) else "head_signal"
+    if sees == "head_signal" and values["causal"]:
+        raise InputError("conf/estimate.yaml", "sees", "head_signal reads the whole film: causal=false, or sees=flow")
+    return worn if sees == "head_signal" else None
+
+
+def was_rendered(video: Path) -> bool:
+    """Whether the record beside a video says that this project rendered it."""
+    record = video.with_suffix(".json")
+    try:
+        return bool(read_json(record, "rendered").get("rendered")) if record.is_file() else False
+    except (ValueError, AttributeError):
+        return False
 
 
 @dataclass(frozen=True)
@@ -128,14 +163,14 @@ class FilmProcess:
     ) -> None:
         self.close()
 
-    def rows(self, advance: Advance | None = None) -> list[FilmRow]:
-        """The film's rows, all of them; to be called once.
+    def rows(self, advance: Advance | None = None) -> list[Any]:
+        """The film's rows, all of them; to be called once. They are head rows where the settings have ``worn``.
 
         Raises:
             InputError: as :func:`egopose.vision.film.film_rows`.
             RuntimeError: the process ended, for one for want of memory.
         """
-        result: list[FilmRow] = []
+        result: list[Any] = []
         while (rows := self._answer()) is not None:
             result += rows
             if advance is not None:
@@ -233,15 +268,7 @@ def _work(settings: FilmSettings, answers: Any, orders: Any) -> None:
     opengl.start()
     try:
         with _Panels(settings.panel) as panels:
-            rows = film_rows(
-                settings.video,
-                settings.flow,
-                settings.fps,
-                settings.offset,
-                camera=settings.camera,
-                pictures=settings.pictures,
-                watch=panels.keep,
-            )
+            rows = _rows(settings, panels.keep)
             while some := list(islice(rows, _FRAMES)):
                 answers.put(some)
             answers.put(None)
@@ -257,6 +284,19 @@ def _work(settings: FilmSettings, answers: Any, orders: Any) -> None:
         answers.put(error)
     except Exception as error:
         answers.put(RuntimeError(f"{type(error).__name__}: {error}"))
+
+
+def _rows(settings: FilmSettings, watch: Callable[[Frame], None]) -> Iterator[FilmRow | HeadRow]:
+    """The rows that the settings ask for."""
+    video, fps, offset = settings.video, settings.fps, settings.offset
+    if settings.worn is None:
+        yield from film_rows(
+            video, settings.flow, fps, offset, camera=settings.camera, pictures=settings.pictures, watch=watch
+        )
+        return
+    telemetry = telemetry_of(video, settings.worn)
+    camera, _ = film_camera(video, settings.camera, telemetry)
+    yield from head_rows(video, fps, offset, camera, telemetry, watch)
 
 
 class _Stopped(Exception):

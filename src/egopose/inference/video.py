@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Mapping
 from contextlib import ExitStack
 from pathlib import Path
@@ -18,7 +19,9 @@ from egopose.core.runtime import settle_heap
 from egopose.data.preparation import humanoid_of
 from egopose.inference.estimator import estimate_takes, restart_path
 from egopose.inference.failsafe import FailSafe, FailSafeSettings
-from egopose.inference.film_process import Drawing, FilmProcess, FilmSettings
+from egopose.inference.film_agreement import film_agreement
+from egopose.inference.film_process import Drawing, FilmProcess, FilmSettings, was_rendered
+from egopose.inference.film_states import FilmReading, read_states, seen_in_film
 from egopose.inference.outputs import TakeVideo, write_footage, write_motion_files
 from egopose.inference.planner import Planner
 from egopose.inference.planner_settings import PlannerSettings, planned_threshold, planner_settings
@@ -51,6 +54,7 @@ def run_estimate(
     film: FilmProcess,
     out: Path,
     progress: StageProgress,
+    reading: FilmReading | None = None,
 ) -> Path:
     """Estimate the motion of a video and write the results.
 
@@ -61,6 +65,7 @@ def run_estimate(
         film: whose rows were read; it draws.
         out: folder of the results: ``estimate.bvh``, ``estimate.npz``, ``frames.csv``, ``side_by_side.mp4``.
         progress: is told.
+        reading: of the film, with which the motion is compared; None where the head signal was not read.
 
     Returns:
         The folder.
@@ -101,12 +106,32 @@ def run_estimate(
     motion = estimate.motion(humanoid, pose_motion.name)
     out.mkdir(parents=True, exist_ok=True)
     write_motion_files(out, "estimate", motion)
-    write_columns_csv(out / "frames.csv", estimate.columns())
+    columns = estimate.columns()
+    agreement = None
+    if reading is not None:
+        agreement = film_agreement(humanoid, motion.qpos, reading, str(config["worn"]["mount"]))
+        columns |= agreement.columns()
+    write_columns_csv(out / "frames.csv", columns)
     write_footage(out, seen, 0, motion.fps)
     with progress.stage(DRAWING) as advance:
         film.finish(advance)
     print(f"{len(motion)} frames, {estimate.n_resets} resets by the fail-safe; written to {out}", flush=True)
+    if reading is not None and agreement is not None:
+        for note in reading.notes:
+            print(f"note: {note}", flush=True)
+        print(agreement.sentence, flush=True)
     return out
+
+
+def warn_of_film(video: Path, body_parts: bool) -> None:
+    """Say on standard error that a film is read by what was trained on rendered pictures alone."""
+    if body_parts and not was_rendered(video):
+        print(
+            f"warning: {video} is a film, and the body-part estimator knows rendered pictures only: it takes pavements "
+            "for bodies. sees=head_signal leaves it out",
+            file=sys.stderr,
+            flush=True,
+        )
 
 
 def allowed_planner(config: Mapping[str, Any]) -> PlannerSettings | None:
@@ -173,18 +198,23 @@ def estimate_video(values: Mapping[str, Any], foreseen: FilmProcess | None = Non
             film = stack.enter_context(FilmProcess(settings))
         with progress.stage(READING) as advance:
             rows = film.rows(advance)
+        overrides, reading = None, None
         with progress.stage(SEEING):
-            flow = np.stack([row[0] for row in rows])
-            if finder is not None:
-                flow = with_body_parts(finder, [row[1] for row in rows if row[1] is not None], flow)
-            overrides = None
-            if lookahead is None:
-                seen = seen_in(humanoid, regressor, flow, source_config)
+            if settings.worn is not None:
+                reading = read_states(humanoid, rows, video, settings.camera, settings.worn)
+                seen = seen_in_film(humanoid, reading, regressor, source_config)
             else:
-                causal = causal_regression(humanoid, regressor, source_config, run["task"], lookahead)
-                seen = seen_live(causal, regressor, flow, source_config)
-                # What is seen live is smoothed already.
-                overrides = {"task": {**run["task"], "action": {**run["task"]["action"], "smoothing": 0.0}}}
+                warn_of_film(video, finder is not None)
+                flow = np.stack([row[0] for row in rows])
+                if finder is not None:
+                    flow = with_body_parts(finder, [row[1] for row in rows if row[1] is not None], flow)
+                if lookahead is None:
+                    seen = seen_in(humanoid, regressor, flow, source_config)
+                else:
+                    causal = causal_regression(humanoid, regressor, source_config, run["task"], lookahead)
+                    seen = seen_live(causal, regressor, flow, source_config)
+                    # What is seen live is smoothed already.
+                    overrides = {"task": {**run["task"], "action": {**run["task"]["action"], "smoothing": 0.0}}}
             dataset, pose_motion = video_dataset(humanoid, seen, video.stem)
             agent = load_agent(checkpoint, dataset, overrides=overrides)
-        return run_estimate(values, agent, pose_motion, film, out, progress)
+        return run_estimate(values, agent, pose_motion, film, out, progress, reading)

@@ -22,7 +22,7 @@ from egopose.envs.mdp.observations import humanoid_state_rows
 from egopose.humanoid.model import HumanoidModel
 from egopose.models.head_signal_input import SIGNAL_FEATURES, mirrored_features, signal_features
 from egopose.models.mirror import state_mirror
-from egopose.models.regressor import StateRegressor
+from egopose.models.regressor import StateRegressor, state_statistics
 from egopose.motion import rotations as rot
 from egopose.motion.motion import finite_difference
 from egopose.motion.rotations import Array
@@ -53,6 +53,7 @@ class HeadSignalSettings:
         batch: fragments a step.
         epochs, learning_rate, weight_decay: AdamW in one cycle.
         context_size, hidden, dropout: of :class:`StateRegressor`.
+        std_floor: see :func:`~egopose.models.regressor.state_statistics`.
         target_clip: standard deviations.
         seed, threads: of all.
     """
@@ -79,6 +80,7 @@ class HeadSignalSettings:
     context_size: int
     hidden: tuple[int, ...]
     dropout: float
+    std_floor: float
     target_clip: float
     seed: int
     threads: int
@@ -204,7 +206,6 @@ def train_head_signal_regressor(
     humanoid: HumanoidModel,
     clips: Sequence[Array],
     settings: HeadSignalSettings,
-    statistics: tuple[Tensor, Tensor],
     progress: Callable[[int, float, float], None] | None = None,
 ) -> StateRegressor:
     """The trained regressor, in evaluation mode.
@@ -213,7 +214,6 @@ def train_head_signal_regressor(
         humanoid: whose states it gives.
         clips: ``qpos [T, nq]`` at the control rate.
         settings: of all.
-        statistics: mean and standard deviation ``[S]`` of states, the regressor's own units.
         progress: told epoch, mean squared error and seconds after each epoch.
 
     Raises:
@@ -221,6 +221,12 @@ def train_head_signal_regressor(
     """
     with torch_threads(settings.threads), torch.random.fork_rng(devices=[]):
         torch.manual_seed(settings.seed)
+        rng, generator = np.random.default_rng(settings.seed), torch.Generator().manual_seed(settings.seed)
+        pool = [example for _ in range(settings.variants) for example in draw_examples(humanoid, clips, settings, rng)]
+        if not pool:
+            raise InputError("head_signal", "takes", "none is long enough to learn from")
+        mirror = state_mirror(humanoid.skeleton)
+        statistics = state_statistics(torch.cat([example.states for example in pool]), settings.std_floor)
         model = StateRegressor(
             None,
             *statistics,
@@ -229,11 +235,6 @@ def train_head_signal_regressor(
             settings.hidden,
             settings.dropout,
         )
-        rng, generator = np.random.default_rng(settings.seed), torch.Generator().manual_seed(settings.seed)
-        pool = [example for _ in range(settings.variants) for example in draw_examples(humanoid, clips, settings, rng)]
-        if not pool:
-            raise InputError("head_signal", "takes", "none is long enough to learn from")
-        mirror = state_mirror(humanoid.skeleton)
         weights = torch.tensor([float(len(example.states)) for example in pool])
         steps = max(1, int(weights.sum() / settings.variants / settings.length / settings.batch))
         optimiser = torch.optim.AdamW(model.parameters(), lr=settings.learning_rate, weight_decay=settings.weight_decay)

@@ -13,12 +13,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from egopose.motion.rotations import Array
 
 #: rad below the horizon at which a point counts as floor: nearer to it, 1/Z is mostly error.
 _BELOW = float(np.deg2rad(8.0))
-#: Heights a second: the prior of velocities ahead, left and up. It decides where no ground is seen: people stand or walk.
+#: Heights a second: the prior of velocities ahead, left and up, which decides where no ground is seen.
 _USUAL = np.array([1.5, 0.4, 0.4])
 _WALK = 0.8  # heights a second ahead: where the fit begins
 #: Inverse depth of points off the ground, in camera heights: a wall stands one height to infinitely far away.
@@ -30,6 +31,8 @@ _LEAST = 2e-4
 #: The rounds begin with a wide scale along the motion, and narrow it by this factor.
 _ANNEAL = 0.6
 _ROUNDS = 8
+#: A point is explained by the camera's motion up to this share of its own, or so many focal lengths.
+_EXPLAINED, _PIXEL = 0.2, 2e-3
 _BATCH = 256  # frames at a time
 
 
@@ -44,6 +47,7 @@ class GroundMotion:
         turn_deviation: ``[T]`` standard deviation of the turn, rad a frame.
         share: ``[T]`` in 0..1: the weight of the points below the horizon that move as the floor does.
         ground: ``[T]`` in 0..1: the share of the picture that lies below the horizon.
+        rigid: ``[T]`` in 0..1: the share of the points that one camera's motion explains, at whatever depth.
     """
 
     turn: Array
@@ -52,6 +56,7 @@ class GroundMotion:
     turn_deviation: Array
     share: Array
     ground: Array
+    rigid: Array
 
 
 def pixel_rays(height: int, width: int, field_of_view: float) -> tuple[Array, float]:
@@ -82,7 +87,7 @@ def fit_ground_motion(moved: Array, rays: Array, down: Array, fps: float, turn: 
     """Turn and velocity of every frame.
 
     Args:
-        moved: ``[T, 2, P]`` flow in focal lengths a frame, right and down, at ``rays``.
+        moved: ``[T, 2, P]`` flow in focal lengths a frame, right and down, at ``rays``. NaN counts for nothing.
         rays: ``[2, P]``, see :func:`pixel_rays`.
         down: ``[T, 3]`` unit vectors down in the camera's axes.
         fps: frames/s, for the prior of velocities.
@@ -95,16 +100,16 @@ def fit_ground_motion(moved: Array, rays: Array, down: Array, fps: float, turn: 
         parts.append(_fit(moved[rows], rays, down[rows], fps, known))
     if not parts:
         none = np.zeros(0)
-        return GroundMotion(np.zeros((0, 3)), np.zeros((0, 3)), none, none, none, none)
+        return GroundMotion(np.zeros((0, 3)), np.zeros((0, 3)), none, none, none, none, none)
     return GroundMotion(*(np.concatenate(column) for column in zip(*parts, strict=True)))
 
 
-def _fit(
-    moved: Array, rays: Array, down: Array, fps: float, known: Array | None
-) -> tuple[Array, Array, Array, Array, Array, Array]:
+def _fit(moved: Array, rays: Array, down: Array, fps: float, known: Array | None) -> tuple[Array, ...]:
     x, y = rays
+    shown = np.asarray(np.isfinite(moved).all(1))
+    moved = np.where(shown[:, None], moved, 0.0)
     depth = x * down[:, :1] + y * down[:, 1:2] + down[:, 2:]
-    floor = depth > np.sin(_BELOW) * np.sqrt(1 + x * x + y * y)
+    floor = np.asarray(shown & (depth > np.sin(_BELOW) * np.sqrt(1 + x * x + y * y)))
     depth = np.where(floor, depth, 0.0)
     count, pixels = depth.shape
     axes = gravity_axes(down)
@@ -122,19 +127,28 @@ def _fit(
         fitted[:, :3] = known
         wanted = moved - np.stack([np.einsum("ti,tip->tp", known, j[:, :3]) for j in (right, below)], 1)
         right, below, prior, first = right[:, 3:], below[:, 3:], prior[:, 3:, 3:], 3
-    normal, weight, square = _reweighted(wanted, right, below, floor, prior, rays, fitted, first)
+    normal, weight, square, rigid = _reweighted(wanted, right, below, shown, floor, prior, rays, fitted, first)
     spread = np.linalg.inv(normal) * (square * _SHARED)[:, None, None]
     variances = np.diagonal(spread, axis1=1, axis2=2)
     share = (weight * floor).sum(1) / np.maximum(floor.sum(1), 1)
     turned = np.sqrt(variances[:, :3].max(1)) if known is None else np.zeros(count)
     moves = np.sqrt(variances[:, -3:].max(1))
-    return fitted[:, :3], fitted[:, 3:], moves, turned, share, floor.mean(1)
+    return fitted[:, :3], fitted[:, 3:], moves, turned, share, floor.mean(1), rigid
 
 
 def _reweighted(
-    moved: Array, right: Array, below: Array, floor: Array, prior: Array, rays: Array, fitted: Array, first: int
-) -> tuple[Array, Array, Array]:
-    """Fill ``fitted [T, 6]`` from column ``first`` on; returns the normal matrix, weights ``[T, P]`` and variances.
+    moved: Array,
+    right: Array,
+    below: Array,
+    shown: NDArray[np.bool_],
+    floor: NDArray[np.bool_],
+    prior: Array,
+    rays: Array,
+    fitted: Array,
+    first: int,
+) -> tuple[Array, Array, Array, Array]:
+    """Fill ``fitted [T, 6]`` from column ``first`` on; returns the normal matrix, weights ``[T, P]``,
+    variances and the share of the points that are explained ``[T]``.
 
     Each point's error is split into the direction in which the velocity moves it and the one across. Along the former
     a point of unknown depth may be anywhere (:data:`_INVERSE_DEPTH`). Weights are Cauchy's.
@@ -153,12 +167,13 @@ def _reweighted(
         cos, sin = along_right / speed, along_below / speed
         along, across = error_right * cos + error_below * sin, error_below * cos - error_right * sin
         # Across, no depth disturbs the flow: what is left there is its noise.
-        square = (1.48 * np.median(np.abs(across), axis=1) + _LEAST) ** 2
+        square = (1.48 * _median(np.abs(across), shown) + _LEAST) ** 2
         one = square[:, None]
-        coarse = 1.48 * _ANNEAL**number * np.median(np.where(floor, np.abs(along), np.abs(across)), axis=1)
+        off = np.where(floor, np.abs(along), np.abs(across))
+        coarse = 1.48 * _ANNEAL**number * _median(off, shown)
         wide = np.maximum(one, coarse[:, None] ** 2)
         spread = np.where(floor, wide, one + (_INVERSE_DEPTH * speed) ** 2)
-        weight = 1.0 / (1.0 + along**2 / spread + across**2 / one)
+        weight = shown / (1.0 + along**2 / spread + across**2 / one)
         wide = np.where(floor, one, spread)
         first_rows, second_rows = (
             right * cos[:, None] + below * sin[:, None],
@@ -171,4 +186,16 @@ def _reweighted(
         normal = normal + prior * one[..., None] * _SHARED + tiny
         target = first_weighted @ first_moved[..., None] + second_weighted @ second_moved[..., None]
         fitted[:, first:] = np.linalg.solve(normal, target)[..., 0]
-    return normal, weight, square
+    # Explained: across the motion by a third of a pixel in 240, or by a fifth of how far the point moved.
+    far = np.hypot(moved[:, 0], moved[:, 1])
+    explained = shown & (np.abs(across) < np.maximum(_EXPLAINED * far, _PIXEL))
+    rigid = explained.sum(1) / np.maximum(shown.sum(1), 1)
+    return normal, weight, square, rigid
+
+
+def _median(values: Array, shown: NDArray[np.bool_]) -> Array:
+    """``[T]`` medians of ``values [T, P]`` where ``shown``; 0 where nothing is."""
+    ordered = np.sort(np.where(shown, values, np.inf), axis=1)
+    count = shown.sum(1)
+    middle = ordered[np.arange(len(values)), np.maximum(count - 1, 0) // 2]
+    return np.where(count > 0, middle, 0.0)

@@ -20,7 +20,7 @@ from egopose.vision.ground_motion import GroundMotion, fit_ground_motion, gravit
 
 #: s, standard deviation of the Gaussian that steadies the vertical: nodding stays in the signal.
 _STEADY = 4.0 / 30.0
-#: s over which a tilt without an instrument returns to the mean: long enough for the nodding of steps, too short to drift.
+#: s over which a tilt without an instrument returns to its mean: long enough for nodding, too short to drift.
 _TILT_MEMORY = 0.3
 #: Heights a second and rad/s: numbers this uncertain have half of the quality.
 _DOUBTFUL_VELOCITY, _DOUBTFUL_TURN = 0.1, 0.1
@@ -51,7 +51,7 @@ class HeadSignal:
         turning: ``[T, 3]`` rad/s about the axes ahead, left, up.
         velocity: ``[T, 3]`` camera heights a second ahead, left, up.
         tilt: ``[T, 2]`` rad: how far the camera looks below the horizon, and its roll; steadied.
-        quality: ``[T, 2]`` in 0..1, of turning and of velocity.
+        quality: ``[T, 3]`` in 0..1: of turning, of velocity, and the share of the picture that one camera explains.
     """
 
     turning: Array
@@ -63,8 +63,8 @@ class HeadSignal:
         return len(self.turning)
 
     def numbers(self) -> Array:
-        """``[T, 10]``: turning, velocity, tilt and quality side by side, as a regressor reads them."""
-        return np.concatenate([self.turning, self.velocity, self.tilt, self.quality], axis=1)
+        """``[T, 10]``: turning, velocity, tilt and their two qualities side by side, as a regressor reads them."""
+        return np.concatenate([self.turning, self.velocity, self.tilt, self.quality[:, :2]], axis=1)
 
 
 def tilt_of(down: Array) -> Array:
@@ -98,7 +98,7 @@ def signal_of_motion(positions: Array, rotations: Array, fps: float) -> HeadSign
     turn[1:] = Rotation.from_matrix(np.swapaxes(rotations[:-1], 1, 2) @ rotations[1:]).as_rotvec() * fps
     step[1:] = np.diff(positions, axis=0) * fps / np.maximum(positions[1:, 2:], 0.2)
     velocity = np.einsum("tji,tj->ti", rotations, step)
-    quality = np.ones((len(positions), 2))
+    quality = np.ones((len(positions), 3))
     quality[:1] = 0.0
     return HeadSignal(_in(axes, turn), _in(axes, velocity), tilt_of(down), quality)
 
@@ -106,40 +106,48 @@ def signal_of_motion(positions: Array, rotations: Array, fps: float) -> HeadSign
 def signal_of_flow(
     flow: NDArray[np.floating],
     field_of_view: float,
-    fps: float,
+    intervals: Array,
     down: Array | None = None,
     turning: Array | None = None,
     pitch_down: float | None = None,
+    steadied_picture: bool = False,
 ) -> HeadSignal:
     """The signal seen in a film.
 
     Args:
-        flow: ``[T, 2, H, W]`` of pinhole pictures, in picture widths a frame, channel 0 right, 1 down.
+        flow: ``[T, 2, H, W]`` of pinhole pictures, in picture widths a frame, channel 0 right, 1 down. NaN counts for
+            nothing.
         field_of_view: degrees across the picture's width.
-        fps: frames/s.
+        intervals: ``[T]`` s that each frame's flow took.
         down: ``[T, 3]`` unit vectors down in the camera's axes, where an instrument knows them.
         turning: ``[T, 3]`` rad/s in the camera's axes, where a gyroscope knows it. Its constant part is believed to
-            the picture: gyroscopes drift.
+            the vertical and the picture: gyroscopes drift.
         pitch_down: rad, how far the camera looks below the horizon on average; None finds it in the film. Not read
             where ``down`` is given.
+        steadied_picture: the picture does not turn as the gyroscope does; both are believed, each for its own.
     """
     moved, rays = _cells(flow, field_of_view)
-    known = down
+    fps = 1.0 / float(np.median(intervals))
+    known, seconds = down, intervals[:, None]
     if down is None:
         level = np.broadcast_to(down_of(USUAL_PITCH, 0.0), (len(moved), 3))
-        seen = fit_ground_motion(moved, rays, level, fps).turn if turning is None else turning / fps
-        pitch = pitch_of_film(moved, rays, fps, seen) if pitch_down is None else pitch_down
+        seen = fit_ground_motion(moved, rays, level, fps).turn if turning is None else turning * seconds
+        pitch = pitch_of_film(moved, rays, fps) if pitch_down is None else pitch_down
         down = down_from_turning(seen, pitch, fps)
-    free = fit_ground_motion(moved, rays, down, fps)
-    fit = free
+    fit = fit_ground_motion(moved, rays, down, fps)
+    turn, turn_quality = fit.turn, 1.0 / (1.0 + (fit.turn_deviation * fps / _DOUBTFUL_TURN) ** 2)
     if turning is not None:
-        fit = fit_ground_motion(moved, rays, down, fps, without_bias(turning / fps, free, known))
+        turn_quality = np.ones(len(moved))
+        if steadied_picture:
+            turn = turning * seconds
+        else:
+            turn = without_bias(turning * seconds, fit, known)
+            fit = fit_ground_motion(moved, rays, down, fps, turn)
     axes = gravity_axes(steadied(down, fps))
-    turned = 1.0 / (1.0 + (fit.turn_deviation * fps / _DOUBTFUL_TURN) ** 2)
-    quality = np.stack([turned, velocity_quality(fit, fps)], axis=1)
+    quality = np.stack([turn_quality, velocity_quality(fit, fps), fit.rigid], axis=1)
     quality[:1] = 0.0
     tilt = tilt_of(steadied(down, fps))
-    return HeadSignal(_in(axes, fit.turn) * fps, _in(axes, fit.velocity) * fps, tilt, quality)
+    return HeadSignal(_in(axes, turn) / seconds, _in(axes, fit.velocity) / seconds, tilt, quality)
 
 
 def velocity_quality(fit: GroundMotion, fps: float) -> Array:
@@ -201,7 +209,7 @@ def down_from_turning(turn: Array, pitch_down: float, fps: float) -> Array:
     return down
 
 
-def pitch_of_film(moved: Array, rays: Array, fps: float, turn: Array) -> float:
+def pitch_of_film(moved: Array, rays: Array, fps: float) -> float:
     """How far the camera looks below the horizon (rad), from a film in which somebody walks on level ground.
 
     Whoever walks there neither rises nor sinks. With the pitch too small, walking ahead seems to rise; too large, to
@@ -211,7 +219,6 @@ def pitch_of_film(moved: Array, rays: Array, fps: float, turn: Array) -> float:
         moved: ``[T, 2, P]`` flow in focal lengths a frame, at ``rays [2, P]``.
         rays: see :func:`egopose.vision.ground_motion.pixel_rays`.
         fps: frames/s.
-        turn: ``[T, 3]`` rad a frame, for the camera's nodding.
     """
     chosen = np.unique(np.linspace(1, len(moved) - 1, min(_PITCH_FRAMES, max(len(moved) - 1, 1))).astype(int))
     chosen = chosen[chosen < len(moved)]
@@ -245,11 +252,12 @@ def _cells(flow: NDArray[np.floating], field_of_view: float) -> tuple[Array, Arr
     frames, _, height, width = flow.shape
     step = max(1, width // _CELLS)
     rows, columns = height // step, width // step
-    cut = np.asarray(flow, dtype=np.float64)[:, :, : rows * step, : columns * step]
+    top, left = (height - rows * step) // 2, (width - columns * step) // 2
+    cut = np.asarray(flow, dtype=np.float64)[:, :, top : top + rows * step, left : left + columns * step]
     cells = cut.reshape(frames, 2, rows, step, columns, step).mean((3, 5))
-    # Whole cells are cut from the upper left: the view that is left is the whole one where sizes divide.
+    # Where sizes do not divide, whole cells from the middle are kept, and their view is narrower.
     rays, focal = pixel_rays(rows, columns, field_of_view)
-    return cells.reshape(frames, 2, -1) / focal, rays
+    return cells.reshape(frames, 2, -1) / focal, rays * (columns * step / width)
 
 
 def _in(axes: Array, vectors: Array) -> Array:

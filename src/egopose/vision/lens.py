@@ -25,6 +25,8 @@ STABILISED = ("undo", "ignore")
 _WIDEST = np.deg2rad(85.0)
 _MOST_COEFFICIENTS = {"pinhole": 5, "fisheye": 4}
 
+_Maps = Callable[[Array], tuple[NDArray[np.float32], NDArray[np.float32]]]
+
 
 @dataclass(frozen=True)
 class Camera:
@@ -150,27 +152,68 @@ class Camera:
         def rectify(frame: Frame, turn: Array) -> tuple[Frame, NDArray[np.bool_]]:
             small = shrink(frame)
             across, down = maps(to_matrix(turn))
-            rows, columns = small.shape[:2]
-            inside = (across >= -0.5) & (across <= columns - 0.5) & (down >= -0.5) & (down <= rows - 0.5)
-            return _sampled(small, across, down), inside
+            return _sampled(small, across, down), _inside(small, across, down)
 
         return rectify
 
-    def _maps(
-        self, width: int, height: int, size: int
-    ) -> tuple[Callable[[Frame], Frame], Callable[[Array], tuple[NDArray[np.float32], NDArray[np.float32]]]]:
+    def wide_view(self, width: int, height: int, most: float) -> tuple[float, float]:
+        """Degrees across and down the pinhole picture that shows the most of a frame, at most ``most`` either way."""
+        focal, angles = self.focal_length(width), np.linspace(0.0, _WIDEST, 2000)
+        radii = self.radius(angles)
+        halves = [angles[int(np.argmin(radii <= 0.5 * side / focal)) - 1] for side in (width, height)]
+        return tuple(float(min(np.rad2deg(2 * half), most)) for half in halves)  # type: ignore[return-value]
+
+    def wide_rectifier(
+        self, width: int, height: int, across: int, most: float
+    ) -> Callable[[Frame, Array | None], tuple[Frame, NDArray[np.bool_] | None]]:
+        """What turns a frame into a pinhole's picture ``across`` pixels wide that shows the most of it.
+
+        Args:
+            width, height: of frames, pixels.
+            across: pixels of the result's width; its height follows from :meth:`wide_view`.
+            most: degrees, see :meth:`wide_view`.
+
+        Returns:
+            A function of a frame and how it is turned against the camera (:meth:`turning_rectifier`) or None. It gives
+            the picture, and where the frame has a picture of it (None: everywhere).
+
+        Raises:
+            InputError: as :meth:`rectifier`.
+        """
+        wide, high = (np.tan(np.deg2rad(0.5 * view)) for view in self.wide_view(width, height, most))
+        down = max(round(across * float(high / wide)), 8)
+        view = 0.5 * across / float(wide)
+        shrink, maps = self._maps_to(width, height, (across, down), view, across / width)
+        still = maps(np.eye(3))
+
+        def rectify(frame: Frame, turn: Array | None) -> tuple[Frame, NDArray[np.bool_] | None]:
+            small = shrink(frame)
+            if turn is None:
+                return _sampled(small, *still), None
+            places = maps(to_matrix(turn))
+            return _sampled(small, *places), _inside(small, *places)
+
+        return rectify
+
+    def _maps(self, width: int, height: int, size: int) -> tuple[Callable[[Frame], Frame], _Maps]:
         """What shrinks a frame, and from which places of the shrunk one the square of a turned camera is sampled."""
+        side = 2 * size
+        focal = 0.5 * side / float(np.tan(np.deg2rad(0.5 * self.seen_view(width, height))))
+        return self._maps_to(width, height, (side, side), focal, side / min(width, height))
+
+    def _maps_to(
+        self, width: int, height: int, size: tuple[int, int], focal: float, scale: float
+    ) -> tuple[Callable[[Frame], Frame], _Maps]:
+        """As :meth:`_maps`, for a pinhole of ``size`` (across, down) and focal length ``focal``, in pixels."""
         assert self.field_of_view is not None
         if not (np.diff(self.radius(np.linspace(0.0, np.deg2rad(0.5 * self.field_of_view), 200))) > 0).all():
             raise InputError("camera", "distortion", "folds the picture over: not the coefficients of this lens")
         # Shrunk first: a picture of many pixels sampled at few points would flicker.
-        side = 2 * size
-        scale = min(1.0, side / min(width, height))
+        scale = min(1.0, scale)
         small = (max(round(width * scale), 1), max(round(height * scale), 1))
-        focal = self.focal_length(width) * small[0] / width
-        own = np.array([[focal, 0, 0.5 * (small[0] - 1)], [0, focal, 0.5 * (small[1] - 1)], [0, 0, 1.0]])
-        pinhole = 0.5 * side / np.tan(np.deg2rad(0.5 * self.seen_view(width, height)))
-        square = np.array([[pinhole, 0, 0.5 * (side - 1)], [0, pinhole, 0.5 * (side - 1)], [0, 0, 1.0]])
+        own_focal = self.focal_length(width) * small[0] / width
+        own = np.array([[own_focal, 0, 0.5 * (small[0] - 1)], [0, own_focal, 0.5 * (small[1] - 1)], [0, 0, 1.0]])
+        picture = np.array([[focal, 0, 0.5 * (size[0] - 1)], [0, focal, 0.5 * (size[1] - 1)], [0, 0, 1.0]])
         coefficients = np.zeros(4 if self.kind == "fisheye" else 5)
         coefficients[: len(self.distortion)] = self.distortion
         undistort = cv2.fisheye.initUndistortRectifyMap if self.kind == "fisheye" else cv2.initUndistortRectifyMap
@@ -181,10 +224,16 @@ class Camera:
             return cv2.resize(frame, small, interpolation=cv2.INTER_AREA).astype(np.uint8, copy=False)
 
         def maps(turn: Array) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-            across, down = undistort(own, coefficients, turn, square, (side, side), cv2.CV_32FC1)
+            across, down = undistort(own, coefficients, turn, picture, size, cv2.CV_32FC1)
             return np.asarray(across, np.float32), np.asarray(down, np.float32)
 
         return shrink, maps
+
+
+def _inside(frame: Frame, across: NDArray[np.float32], down: NDArray[np.float32]) -> NDArray[np.bool_]:
+    """Which places lie in the frame."""
+    rows, columns = frame.shape[:2]
+    return (across >= -0.5) & (across <= columns - 0.5) & (down >= -0.5) & (down <= rows - 0.5)
 
 
 def _sampled(frame: Frame, across: NDArray[np.float32], down: NDArray[np.float32]) -> Frame:

@@ -27,6 +27,8 @@ from egopose.vision.video import Frame
 _WIDEST_TANGENT = 2.4
 # Pinholes that are put together show a little more than is needed: rows turn against their band's middle.
 _MARGIN = 1.04
+# Of a fisheye: pixels of a pinhole for one of the picture's, in the middle. Off the axis a pinhole is sharper anyway.
+_SHARPNESS = 0.8
 # Widest lenses, degrees across and to the corner: two pinholes turned by a third of the width see no further.
 _WIDEST = {"pinhole": 125.0, "fisheye": 140.0}
 
@@ -259,5 +261,6 @@ def _views(optics: Optics) -> tuple[_View, ...]:
 
 def _view(turn: float, flat: Array, optics: Optics) -> _View:
     wide, high = _MARGIN * flat.max(0)
-    size = (int(np.ceil(2 * wide * optics.focal)), int(np.ceil(2 * high * optics.focal)))
+    focal = optics.focal * (_SHARPNESS if optics.lens == "fisheye" else 1.0)
+    size = (int(np.ceil(2 * wide * focal)), int(np.ceil(2 * high * focal)))
     return _View(turn, (float(wide), float(high)), size)

@@ -1,4 +1,4 @@
-"""People who pass: figures of capsules that walk to and fro along straight lanes beside the wearer's way.
+"""People who pass: figures of capsules that walk to and fro along straight lines beside the wearer's way.
 
 Their parts are MuJoCo's mocap bodies, so that a model with people has the coordinates it had without.
 """
@@ -15,7 +15,7 @@ from egopose.vision.places.place import Place, Way, pattern_materials
 from egopose.vision.surfaces import CLOTH_BASE, CLOTH_CONTRAST
 
 _PARTS = ("trunk", "left_leg", "right_leg", "left_arm", "right_arm")
-# Nearest that anyone comes to the wearer, m; metres that a lane is long at most.
+# Nearest that anyone comes to the wearer, m; metres of a line at most.
 _APART, _LONGEST = 0.9, 12.0
 # Hips, shoulders and their half breadths, of an adult 1.75 m tall, m; the swing of legs and arms, rad; m a cycle.
 _HIP, _SHOULDER, _HIP_Y, _SHOULDER_Y, _SWING, _STRIDE = 0.92, 1.42, 0.09, 0.22, 0.45, 1.4
@@ -57,8 +57,8 @@ def draw_passers(rng: np.random.Generator, way: Way, place: Place, count: int) -
         length = min(float(np.linalg.norm(step)), _LONGEST)
         bearing = float(np.arctan2(step[1], step[0]))
         direction = np.array([np.cos(bearing), np.sin(bearing)])
-        lane = ends[0] + np.linspace(0.0, length, 25)[:, None] * direction
-        if length > 2.0 and min(way.distance(point) for point in lane) > _APART:
+        line = ends[0] + np.linspace(0.0, length, 25)[:, None] * direction
+        if length > 2.0 and min(way.distance(point) for point in line) > _APART:
             speed, phase, scale = rng.uniform(1.0, 1.5), rng.uniform(0, 2 * length), rng.uniform(0.88, 1.08)
             found.append(Passer((float(ends[0, 0]), float(ends[0, 1])), bearing, length, speed, phase, scale))
     return tuple(found)
