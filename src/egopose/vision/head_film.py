@@ -5,7 +5,10 @@ Reading needs nothing of torch, so a process that only reads films can do it.
 
 from __future__ import annotations
 
+import threading
+from collections import deque
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from os import PathLike
 from pathlib import Path
@@ -38,8 +41,13 @@ _ACROSS, _CELLS = 240, 24
 _MOST_VIEW = 105.0
 #: Degrees across a frame of which nothing is known: a phone's main camera filming video has 60 to 70.
 UNKNOWN_VIEW = 65.0
+#: Threads that rectify and compute flow beside the one that decodes.
+_WORKERS = 2
 #: Share of a cell that the film must show for the cell to count.
 _SHOWN = 0.99
+
+#: A rectified frame in grey, and where the film shows it (None: everywhere).
+_Seen = tuple[NDArray[np.uint8], NDArray[np.bool_] | None]
 
 
 @dataclass(frozen=True)
@@ -149,34 +157,48 @@ def head_rows(
     across, _ = camera.wide_view(info.width, info.height, _MOST_VIEW)
     rectify = camera.wide_rectifier(info.width, info.height, _ACROSS, _MOST_VIEW)
     undo = telemetry is not None and telemetry.image_orientation is not None and camera.stabilised != "ignore"
-    dis = cv2.DISOpticalFlow.create(PRESETS["medium"])
-    before: tuple[float, NDArray[np.uint8], NDArray[np.bool_] | None] | None = None
-    row: HeadRow | None = None
-    for time, frame in timed_frames(video, fps, offset - 0.5 * camera.delay, count, camera.fps):
-        if watch is not None:
-            watch(frame)
-        if row is not None and before is not None and time <= before[0]:
-            yield row  # the film has fewer frames: the last one's motion goes on
-            continue
+    own = threading.local()
+
+    def seen(time: float, frame: Frame) -> _Seen:
         turn = None
         if undo and telemetry is not None:
             turned = image_rotation(telemetry, np.array([time]))
             turn = None if turned is None else turned[0]
         picture, shown = rectify(frame, turn)
-        grey = cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY).astype(np.uint8, copy=False)
+        return cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY).astype(np.uint8, copy=False), shown
+
+    def row(time: float, interval: float, before: Future[_Seen] | None, now: Future[_Seen]) -> HeadRow:
+        # Both were handed to the pool earlier and threads take jobs in order: this waits, but never for ever.
+        grey, shown = now.result()
         if before is None:
-            cells = _cells(np.zeros((*grey.shape, 2), np.float32), shown)
-            row = HeadRow(time, 1.0 / fps, cells, across)
-        else:
-            both = shown if before[2] is None or shown is None else shown & before[2]
-            interval = time - before[0]
-            flow = _cells(np.asarray(dis.calc(before[1], grey, None)), both)  # type: ignore[call-overload]
-            # Widths of the picture a readout, as if the picture were square.
-            high = grey.shape[0] / grey.shape[1]
-            plain = undo_rolling_shutter(flow, camera.delay / high, interval) if camera.delay else flow
-            row = HeadRow(time, interval, plain.astype(np.float32), across)
-        before = (time, grey, shown)
-        yield row
+            return HeadRow(time, interval, _cells(np.zeros((*grey.shape, 2), np.float32), shown), across)
+        if not hasattr(own, "dis"):
+            own.dis = cv2.DISOpticalFlow.create(PRESETS["medium"])
+        past, once = before.result()
+        both = shown if once is None or shown is None else shown & once
+        flow = _cells(np.asarray(own.dis.calc(past, grey, None)), both)
+        # Widths of the picture a readout, as if the picture were square.
+        high = grey.shape[0] / grey.shape[1]
+        plain = undo_rolling_shutter(flow, camera.delay / high, interval) if camera.delay else flow
+        return HeadRow(time, interval, plain.astype(np.float32), across)
+
+    last: tuple[float, Future[_Seen]] | None = None
+    pending: deque[Future[HeadRow]] = deque()
+    with ThreadPoolExecutor(_WORKERS) as pool:
+        for time, frame in timed_frames(video, fps, offset - 0.5 * camera.delay, count, camera.fps):
+            if watch is not None:
+                watch(frame)
+            if last is not None and time <= last[0]:
+                pending.append(pending[-1])  # the film has fewer frames: the last one's motion goes on
+            else:
+                now = pool.submit(seen, time, frame)
+                interval = 1.0 / fps if last is None else time - last[0]
+                pending.append(pool.submit(row, time, interval, None if last is None else last[1], now))
+                last = (time, now)
+            if len(pending) > 4 * _WORKERS:
+                yield pending.popleft().result()
+        while pending:
+            yield pending.popleft().result()
 
 
 def _cells(dense: NDArray[np.floating], shown: NDArray[np.bool_] | None) -> NDArray[np.float32]:
