@@ -34,6 +34,8 @@ _PITCHES = np.deg2rad(np.arange(-15.0, 61.0, 5.0))
 USUAL_PITCH = float(np.deg2rad(20.0))
 #: Frames of a film that are looked at for its pitch.
 _PITCH_FRAMES = 240
+# s over which gyroscope and picture are compared, how strictly, and rad/s that count for nothing.
+_AGREEMENT, _STRICT, _STILL = 1.0, 5.0, 0.05
 #: Slow frames that are enough to know a gyroscope's bias.
 _SLOW_FRAMES = 15
 #: Heights a second: the mean speed below which a film tells nothing of its pitch.
@@ -137,11 +139,11 @@ def signal_of_flow(
     fit = fit_ground_motion(moved, rays, down, fps)
     turn, turn_quality = fit.turn, 1.0 / (1.0 + (fit.turn_deviation * fps / _DOUBTFUL_TURN) ** 2)
     if turning is not None:
-        turn_quality = np.ones(len(moved))
         if steadied_picture:
-            turn = turning * seconds
+            turn, turn_quality = turning * seconds, np.ones(len(moved))
         else:
             turn = without_bias(turning * seconds, fit, known)
+            turn_quality = turns_agree(turn, fit, fps)
             fit = fit_ground_motion(moved, rays, down, fps, turn)
     axes = gravity_axes(steadied(down, fps))
     quality = np.stack([turn_quality, velocity_quality(fit, fps), fit.rigid], axis=1)
@@ -188,6 +190,17 @@ def without_bias(turn: Array, seen: GroundMotion, down: Array | None) -> Array:
 def _cross(d: Array) -> Array:
     """``[3, 3]``: times b it is b x d."""
     return np.array([[0.0, d[2], -d[1]], [-d[2], 0.0, d[0]], [d[1], -d[0], 0.0]])
+
+
+def turns_agree(turn: Array, seen: GroundMotion, fps: float) -> Array:
+    """``[T]`` in 0..1: 1 where the picture turns as the gyroscope says, over a second; 0 where it does not.
+
+    A lens that is not the film's turns the picture too fast or too slowly.
+    """
+    apart, both = (np.square(v).sum(1) for v in (turn - seen.turn, np.concatenate([turn, seen.turn], axis=1)))
+    window = _AGREEMENT * fps
+    apart, both = (gaussian_filter1d(v, window, mode="nearest") for v in (apart, both))
+    return np.clip(1.0 - _STRICT * apart / (both + 2 * (_STILL / fps) ** 2), 0.0, 1.0)
 
 
 def down_from_turning(turn: Array, pitch_down: float, fps: float) -> Array:
