@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
 import sys
 from collections.abc import Mapping
 from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -76,6 +78,9 @@ def run_estimate(
     """
     failsafe = from_mapping(FailSafeSettings, config["failsafe"], "conf/estimate.yaml: failsafe")
     settings = allowed_planner(config)
+    if settings is not None and reading is not None:
+        # A head signal does not drift as the states' own velocities do: its path stays where it was laid.
+        settings = replace(settings, place_time=math.inf, heading_time=math.inf)
     guard = FailSafe(1, failsafe.for_run(agent.config, planned_threshold(settings)))
     torch.set_num_threads(1)
     options = {"threads": 1, "whole_fragments": True, "falls_end": False}
