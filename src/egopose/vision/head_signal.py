@@ -30,7 +30,8 @@ _NO_FLOOR, _FLOOR = 0.05, 0.30
 #: Cells across the picture in which flow is fitted; more cost time and do not help.
 _CELLS = 24
 #: rad, the pitches among which a film's is looked for, and what is taken where nobody walks.
-_PITCHES = np.deg2rad(np.arange(-15.0, 61.0, 5.0))
+_PITCHES = np.deg2rad(np.arange(-15.0, 61.0, 15.0))
+_HALVINGS = 2  # of the step between them, where the right one lies
 USUAL_PITCH = float(np.deg2rad(20.0))
 #: Frames of a film that are looked at for its pitch.
 _PITCH_FRAMES = 240
@@ -235,19 +236,34 @@ def pitch_of_film(moved: Array, rays: Array, fps: float) -> float:
     """
     chosen = np.unique(np.linspace(1, len(moved) - 1, min(_PITCH_FRAMES, max(len(moved) - 1, 1))).astype(int))
     chosen = chosen[chosen < len(moved)]
-    rises, speeds = [], []
-    for pitch in _PITCHES:
-        down = np.broadcast_to(down_of(float(pitch), 0.0), (len(chosen), 3))
+
+    def walk(pitch: float) -> tuple[float, float]:
+        """How much walking ahead rises with that pitch, and the mean speed ahead."""
+        down = np.broadcast_to(down_of(pitch, 0.0), (len(chosen), 3))
         fit = fit_ground_motion(moved[chosen], rays, down, fps)
         velocity = _in(gravity_axes(down), fit.velocity) * fps
         weight = velocity_quality(fit, fps)
         ahead = velocity[:, 0] * weight
-        speeds.append(float(ahead.sum() / max(weight.sum(), 1e-9)))
-        rises.append(float((velocity[:, 2] * ahead).sum() / max((ahead**2).sum(), 1e-12)))
-    best = zero_crossing(_PITCHES, np.array(rises))
-    if best is None or np.interp(best, _PITCHES, speeds) < _WALKS:
+        speed = float(ahead.sum() / max(weight.sum(), 1e-9))
+        return float((velocity[:, 2] * ahead).sum() / max((ahead**2).sum(), 1e-12)), speed
+
+    found = {float(pitch): walk(float(pitch)) for pitch in _PITCHES}
+    for _ in range(_HALVINGS):
+        best = _crossing_of(found)
+        if best is None:
+            return USUAL_PITCH
+        below, above = (max(p for p in found if p <= best), min(p for p in found if p >= best))
+        found[0.5 * (below + above)] = walk(0.5 * (below + above))
+    best = _crossing_of(found)
+    at = np.array(sorted(found))
+    if best is None or np.interp(best, at, [found[pitch][1] for pitch in at]) < _WALKS:
         return USUAL_PITCH
     return best
+
+
+def _crossing_of(found: dict[float, tuple[float, float]]) -> float | None:
+    at = np.array(sorted(found))
+    return zero_crossing(at, np.array([found[pitch][0] for pitch in at]))
 
 
 def zero_crossing(at: Array, values: Array) -> float | None:
