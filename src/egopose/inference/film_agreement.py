@@ -105,13 +105,15 @@ def signal_agreement(body: HeadSignal, film: HeadSignal, fps: float) -> FilmAgre
         both = _mean(np.square(one).sum(1) + np.square(other).sum(1), fps)
         return np.asarray(np.clip(1.0 - apart / (both + 2 * least**2), 0.0, 1.0))
 
+    # The first frame has no flow: its quality of zero would stand for all that lies before the film.
+    quality = np.concatenate([film.quality[1:2], film.quality[1:]]) if len(film) > 1 else film.quality
     bobs = [np.sqrt(_mean(steps_of(signal.velocity[:, 2], fps) ** 2, fps)) for signal in (body, film)]
     parts = {
         "turning": alike(slow(body.turning[:, 2:]), slow(film.turning[:, 2:]), _TURN),
         "speed": alike(slow(body.velocity[:, :2]), slow(film.velocity[:, :2]), _SPEED),
         "bob": np.clip(1.0 - np.square(bobs[0] - bobs[1]) / (bobs[0] ** 2 + bobs[1] ** 2 + 2 * _BOB**2), 0.0, 1.0),
-        "seen": _mean(film.quality[:, 1], fps),
-        "rigid": _mean(film.quality[:, 2], fps),
+        "seen": _mean(quality[:, 1], fps),
+        "rigid": _mean(quality[:, 2], fps),
     }
     score = np.prod(np.stack(list(parts.values())), axis=0) ** (1 / 3)
     return FilmAgreement(parts, np.clip(score, 0.0, 1.0))

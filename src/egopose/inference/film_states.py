@@ -77,16 +77,11 @@ def read_states(
     return FilmReading(signal, placed, height, tuple(notes))
 
 
-def seen_in_film(
-    humanoid: HumanoidModel, reading: FilmReading, regressor: StateRegressor, source_config: Mapping[str, Any]
-) -> dict[str, Tensor]:
-    """As :func:`egopose.inference.video_regression.seen_in`, of a film's reading.
+def require_states_for_context(source_config: Mapping[str, Any]) -> None:
+    """See that a policy can be told what a head signal says; to be called before the film is read.
 
     Args:
-        humanoid: the run's.
-        reading: of the film.
-        regressor: the run's own, in whose units the policy reads its context.
-        source_config: the groups it was trained with.
+        source_config: the groups that the run's regressor was trained with.
 
     Raises:
         InputError: the policy reads the flow's own context, which a head signal does not have.
@@ -94,6 +89,16 @@ def seen_in_film(
     if not crossed(source_config):
         cause = "the policy reads the context of its own regressor of flow: sees=flow"
         raise InputError("conf/estimate.yaml", "sees", cause)
+
+
+def seen_in_film(humanoid: HumanoidModel, reading: FilmReading, regressor: StateRegressor) -> dict[str, Tensor]:
+    """As :func:`egopose.inference.video_regression.seen_in`, of a film's reading.
+
+    Args:
+        humanoid: the run's.
+        reading: of the film.
+        regressor: the run's own, in whose units the policy reads its context (:func:`require_states_for_context`).
+    """
     return {
         "visual_context": regressor.normalise(reading.states),
         "humanoid_state": reading.states,

@@ -54,6 +54,7 @@ def path_of_signal(signal: HeadSignal, states: Array, height: float, fps: float)
     seen = _turned(signal.velocity[:, :2] * height, facing)
     own = np.zeros_like(seen)
     own[:-1] = _turned(_turned(np.diff(quick[:, :2], axis=0) * fps, -quick[:-1, 2]), heading[:-1])
+    own[-1:] = own[-2:-1]  # the last state leads nowhere: as zero it would be a stop that the filter spreads
     weight = gaussian_filter1d(signal.quality[:, 1], _SLOW_MOVE * fps, mode="nearest")[:, None]
     kept = gaussian_filter1d(signal.quality[:, 1:] * (seen - own), _SLOW_MOVE * fps, axis=0, mode="nearest")
     velocity = own + kept / np.maximum(weight, 0.05)
