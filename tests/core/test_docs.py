@@ -184,7 +184,8 @@ def unknown_settings(text: str) -> list[str]:
     blocks = "\n".join(re.findall(r"```bash\n(.*?)```", text, re.DOTALL)).replace("\\\n", " ")
     out = []
     for verb, rest in re.findall(r"^(?:\w+=\S+ )*(?:egopose |python -m egopose\.)(\w+)(.*)$", blocks, re.MULTILINE):
-        name = "body_parts" if "--config-name body_parts" in rest else verb
+        named = re.search(r"--config-name (\w+)", rest)
+        name = named[1] if named else verb
         if not (ROOT / "conf" / f"{name}.yaml").is_file():
             continue
         words = re.sub(r"'[^']*'|\"[^\"]*\"", lambda m: m[0].strip("'\"").replace(" ", ""), rest.partition(" #")[0])
