@@ -65,5 +65,5 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def settings(video: Path, checkpoint: Path, **changed: Any) -> dict[str, Any]:
     failsafe = {"mode": "value", "reset_threshold": 0.6, "fallen_height": 0.3}
     values = {"which": "latest", "out": None, "offset": 0.0, "size": 64, "failsafe": failsafe}
-    values |= {"causal": False, "lookahead": 10, "camera": {}}
+    values |= {"causal": False, "lookahead": 10, "camera": {}, "sees": "flow", "worn": {}}
     return {"video": str(video), "checkpoint": str(checkpoint), **values, **changed}
