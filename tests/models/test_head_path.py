@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from scipy.ndimage import gaussian_filter1d
 
 from egopose.humanoid.state_layout import StateLayout
-from egopose.models.head_path import path_of_signal, quiet, camera_height, states_on_path
+from egopose.models.head_path import camera_height, path_of_signal, quiet, states_on_path
 from egopose.models.pose_regression import integrated_path
 from egopose.motion import rotations as rot
 from egopose.motion.rotations import Array

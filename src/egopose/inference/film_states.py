@@ -14,7 +14,7 @@ from egopose.checkpoint.head_signal import load_head_signal_regressor
 from egopose.core.errors import InputError
 from egopose.humanoid.model import HumanoidModel
 from egopose.inference.video_regression import crossed
-from egopose.models.head_path import path_of_signal, camera_height, states_on_path
+from egopose.models.head_path import camera_height, path_of_signal, states_on_path
 from egopose.models.head_signal_input import signal_features
 from egopose.models.regressor import StateRegressor
 from egopose.pipeline.regressor import joint_targets
