@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
-from helpers.seen_ground import flow_of_motion
+from helpers.seen_ground import flow_of_motion, flow_of_path, walk
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -40,7 +40,9 @@ def seen(seed: int, walls: bool = True, pitch: tuple[float, float] = (8.0, 45.0)
     ahead = np.array([rng.uniform(0.0, 1.5), rng.uniform(-0.3, 0.3), rng.uniform(-0.3, 0.3)])
     velocity, turn = gravity_axes(down[None])[0].T @ ahead / FPS, rng.uniform(-1.5, 1.5, 3) / FPS
     inverse_depth = rng.uniform(0.0, 0.8, rays.shape[1]) * walls
-    return Seen(flow_of_motion(turn, velocity, down, rays, inverse_depth), rays, down, turn, velocity)
+    moved = flow_of_motion(turn, velocity, down, rays, inverse_depth)
+    # The equations hold where a point is halfway.
+    return Seen(moved, rays - 0.5 * moved, down, turn, velocity)
 
 
 def errors(found: GroundMotion, true: Seen) -> tuple[float, float]:
@@ -72,6 +74,22 @@ def test_a_third_of_wrong_points_does_little(seed: int) -> None:
     assert turn < 0.04
     assert velocity < 0.1
     assert found.rigid[0] == pytest.approx(1 - wrong.mean(), abs=0.12)
+
+
+@pytest.mark.parametrize("rate", [-5.0, -1.0, 2.4])
+def test_quick_turns_do_not_pass_for_speed(rate: float) -> None:
+    """Points that are projected into both frames; the camera turns at up to 290 degrees a second."""
+    positions, rotations = walk(0.5, FPS, 1.44, np.deg2rad(30.0), turn=rate)
+    rays, _ = pixel_rays(14, 24, 90.0)
+    flow = flow_of_path(positions, rotations, rays, np.random.default_rng(1).uniform(3.0, 12.0, rays.shape[1]))
+    down = -rotations[:, 2]
+    found = fit_ground_motion(flow, rays, down, FPS)
+    axes = gravity_axes(down)
+    turn = np.einsum("tij,tj->ti", axes, found.turn)[1:] * FPS
+    np.testing.assert_allclose(turn, [[0.0, 0.0, rate]] * len(turn), atol=0.02)
+    speed = np.linalg.norm(np.einsum("tij,tj->ti", axes, found.velocity)[1:, :2], axis=1) * FPS
+    np.testing.assert_allclose(speed, 1.44 / 1.6, atol=0.08)
+    assert velocity_quality(found, FPS)[1:].min() > 0.9
 
 
 def test_cells_that_show_nothing_count_for_nothing() -> None:
