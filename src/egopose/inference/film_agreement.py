@@ -31,8 +31,8 @@ _TURN, _SPEED, _BOB = 0.12, 0.10, 0.035
 # What a film must reach for a part to count in full, and below which the part is 0. A flat, narrow camera sees little
 # ground and is right all the same; one lens for another leaves a sixth of the points unexplained.
 _SEEN, _RIGID, _MEASURED = (0.0, 0.3), (0.55, 0.82), (0.0, 0.6)
-#: rad/s, turning within steps (root mean square) of a worn camera that stands, and of one that moves by 0.3 heights/s or
-#: more. In motion capture 98 of 100 seconds have 0.05 and 0.12 (heads and chests); real heads stand stiller.
+#: rad/s, turning within steps (root mean square) of a worn camera that stands, and of one that moves by 0.3
+#: heights/s or more. In motion capture 98 of 100 seconds have 0.05 and 0.12 (heads and chests); real heads stand stiller.
 _STANDING_SHAKE, _WALKING_SHAKE, _WALKING = 0.012, 0.10, 0.3
 #: Above the first number the film is followed, below the second it is not.
 FOLLOWS, FOLLOWS_NOT = 0.6, 0.4
@@ -114,15 +114,17 @@ def signal_agreement(body: HeadSignal, film: HeadSignal, fps: float) -> FilmAgre
         both = _mean(np.square(one).sum(1) + np.square(other).sum(1), fps)
         return np.asarray(np.clip(1.0 - apart / (both + 2 * least**2), 0.0, 1.0))
 
+    # The first frame has no flow: its quality of zero would stand for all that lies before the film.
+    quality = np.concatenate([film.quality[1:2], film.quality[1:]]) if len(film) > 1 else film.quality
     bobs = [np.sqrt(_mean(steps_of(signal.velocity[:, 2], fps) ** 2, fps)) for signal in (body, film)]
     parts = {
         "turning": alike(slow(body.turning[:, 2:]), slow(film.turning[:, 2:]), _TURN),
         "speed": alike(slow(body.velocity[:, :2]), slow(film.velocity[:, :2]), _SPEED),
         "bob": np.clip(1.0 - np.square(bobs[0] - bobs[1]) / (bobs[0] ** 2 + bobs[1] ** 2 + 2 * _BOB**2), 0.0, 1.0),
         "worn": worn_share(film, fps),
-        "seen": _reached(_mean(film.quality[:, 1], fps), _SEEN),
-        "rigid": _reached(_mean(film.quality[:, 2], fps), _RIGID),
-        "measured": _reached(_mean(film.quality[:, 0], fps), _MEASURED),
+        "seen": _reached(_mean(quality[:, 1], fps), _SEEN),
+        "rigid": _reached(_mean(quality[:, 2], fps), _RIGID),
+        "measured": _reached(_mean(quality[:, 0], fps), _MEASURED),
     }
     score = np.prod(np.stack(list(parts.values())), axis=0) ** 0.5
     return FilmAgreement(parts, np.clip(score, 0.0, 1.0))
