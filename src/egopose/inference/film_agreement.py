@@ -32,7 +32,7 @@ _TURN, _SPEED, _BOB = 0.12, 0.10, 0.035
 # ground and is right all the same; one lens for another leaves a sixth of the points unexplained.
 _SEEN, _RIGID, _MEASURED = (0.0, 0.3), (0.55, 0.82), (0.0, 0.6)
 #: rad/s, turning within steps (root mean square) of a worn camera that stands, and of one that moves by 0.3
-#: heights/s or more. In motion capture 98 of 100 seconds have 0.05 and 0.12 (heads and chests); real heads stand stiller.
+#: heights/s or more. In motion capture 98 of 100 seconds have 0.05 and 0.12; real heads stand stiller.
 _STANDING_SHAKE, _WALKING_SHAKE, _WALKING = 0.012, 0.10, 0.3
 #: Above the first number the film is followed, below the second it is not.
 FOLLOWS, FOLLOWS_NOT = 0.6, 0.4
