@@ -1,7 +1,7 @@
 """The motions of ``egopose bench film``: people whom no weights saw, on the humanoid, made long by loops and bends.
 
-The clips are in ``assets/bench``. A recorded walk crosses a room in three seconds. Here a cycle of it is looped, and its
-path is bent by a smooth yaw rate, so that walks are long and turn. Standing is one recorded pose that sways.
+The clips are in ``assets/bench``. A recorded walk crosses a room in three seconds. Here a cycle of it is looped, and
+its path is bent by a smooth yaw rate, so that walks are long and turn. Standing is one recorded pose that sways.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from egopose.motion.rotations import Array
 #: Clips by name, in the order of tables.
 CLIPS = ("walk", "brisk", "slow", "standing", "turning")
 #: s, lengths of looped clips. The walk turns 90 degrees left in its first half, and right in its second.
-SECONDS = {"walk": 12.0, "brisk": 6.0, "slow": 6.0, "standing": 15.0, "turning": 8.0}
+SECONDS = {"walk": 10.0, "brisk": 6.0, "slow": 6.0, "standing": 15.0, "turning": 8.0}
 _FPS = 30.0
 _SOURCES = {
     "walk": "cmu35_walking_6",
