@@ -89,7 +89,7 @@ def _cameras(humanoid: HumanoidModel, chosen: Chosen, rounds: int, folder: Path)
         for shot in every:
             qpos = _piece(_half(walk, shot.seed), chosen.seconds)
             for imu, film in _read(humanoid, qpos, shot, chosen, folder):
-                rows.append({**_about(shot, "walk", imu), **film.row})
+                rows.append({**shot.about("walk", imu), **film.row})
             advance()
     return rows
 
@@ -107,7 +107,7 @@ def _clips(humanoid: HumanoidModel, chosen: Chosen, with_bad: bool, folder: Path
         for clip, shot in every:
             qpos = _piece(bench_clip(clip, humanoid), chosen.seconds)
             for imu, film in _read(humanoid, qpos, shot, chosen, folder):
-                films.append(replace(film, row={"kind": "good", **_about(shot, clip, imu), **film.row}))
+                films.append(replace(film, row={"kind": "good", **shot.about(clip, imu), **film.row}))
             if with_bad and clip == "walk":
                 films += shuffled_films(humanoid, folder, shot)
             advance()
@@ -144,14 +144,9 @@ def _bodies(humanoid: HumanoidModel, chosen: Chosen, folder: Path) -> list[dict[
                 raise InputError("bench film", "egopose estimate", last)
             estimate = read_native(out / "estimate.npz").qpos
             count = min(len(estimate), len(qpos))
-            rows.append({**_about(shot, "walk", True), **measures(humanoid, estimate[:count], qpos[:count])})
+            rows.append({**shot.about("walk", True), **measures(humanoid, estimate[:count], qpos[:count])})
             advance()
     return rows
-
-
-def _about(shot: Shot, clip: str, imu: bool) -> dict[str, Any]:
-    about = {name: getattr(shot, name) for name in ("pitch", "width", "stabilised", "place", "seed")}
-    return {"clip": clip, **about, "imu": imu}
 
 
 def _half(walk: Array, seed: int) -> Array:

@@ -6,6 +6,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields
 from itertools import product
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -129,6 +130,11 @@ class Shot:
     def lens(self) -> str:
         """What a lens of that width is."""
         return "fisheye" if self.width > _WIDEST_PINHOLE else "pinhole"
+
+    def about(self, clip: str, imu: bool) -> dict[str, Any]:
+        """What a row of a table says of the film."""
+        said = {name: getattr(self, name) for name in ("pitch", "width", "stabilised", "place", "seed")}
+        return {"clip": clip, **said, "imu": imu}
 
     def camera(self, imu: bool) -> Camera:
         """What ``egopose estimate`` is told of it: with telemetry nothing, without all that its maker tells."""

@@ -23,7 +23,6 @@ from egopose.inference.film_states import FilmReading
 from egopose.motion.rotations import Array
 from egopose.vision.bystander_films import drone_film, moving_picture_film, still_film
 from egopose.vision.head_signal import HeadSignal
-from egopose.vision.lens import Camera
 from egopose.vision.video import read_frames, write_video
 
 #: Kinds of bad film that are rendered anew, for each place; disorder is made of good films.
@@ -98,7 +97,7 @@ def bad_films(
         wide = replace(shot, width=width)
         path = without_telemetry(take(humanoid, walk, wide, folder))
         right = judged(humanoid, read_film(humanoid, path, wide.camera(imu=False)), walk)
-        yield Judged({"kind": "good", **_about(wide, False, ""), **right.row}, right.scores)
+        yield Judged({"kind": "good", **wide.about("", False), **right.row}, right.scores)
         wrong = replace(wide.camera(imu=False), field_of_view=said)
         yield _named(judged(humanoid, read_film(humanoid, path, wrong), walk), kind, wide, False)
         advance()
@@ -124,7 +123,7 @@ def shuffled_films(humanoid: HumanoidModel, folder: Path, shot: Shot) -> Iterato
     rng = np.random.default_rng([shot.seed, 14])
     pieces = np.array_split(np.arange(len(frames)), max(len(frames) // _PIECE, 2))
     orders = (rng.permutation(len(frames)), np.concatenate([pieces[i] for i in rng.permutation(len(pieces))]))
-    camera: Camera = shot.camera(imu=False)
+    camera = shot.camera(imu=False)
     for kind, order in zip(DISORDER, orders, strict=True):
         path = folder / "shuffled.mp4"
         write_video(path, (frames[i] for i in order), 30.0)
@@ -170,10 +169,5 @@ def separation(films: list[Judged]) -> list[dict[str, Any]]:
     ]
 
 
-def _about(shot: Shot, imu: bool, clip: str) -> dict[str, Any]:
-    about = {name: getattr(shot, name) for name in ("pitch", "width", "stabilised", "place", "seed")}
-    return {"clip": clip, **about, "imu": imu}
-
-
 def _named(film: Judged, kind: str, shot: Shot, imu: bool) -> Judged:
-    return replace(film, row={"kind": kind, **_about(shot, imu, ""), **film.row})
+    return replace(film, row={"kind": kind, **shot.about("", imu), **film.row})

@@ -63,7 +63,7 @@ def measures(humanoid: HumanoidModel, estimate: Array, truth: Array) -> dict[str
         "net_path_percent": net_path_error_percent(path, heading, true_path, true_heading),
         "heading_degrees": float(np.rad2deg(heading_error(heading, true_heading, fps))),
         "step_error": abs(steps[0] - steps[1]),
-        "e_pose": float(pose_error(estimate, truth, humanoid.hand_dofs).mean()),
+        "e_pose": float(pose_error(estimate, truth, humanoid.hand_dofs.tolist()).mean()),
         "drift": float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum() / seconds),
         "turn_per_minute": float(np.rad2deg(abs(excess)) * 60.0 / seconds),
     }
