@@ -13,7 +13,15 @@ from hypothesis import strategies as st
 from scipy.stats import mannwhitneyu
 
 from egopose import bench
-from egopose.benchmarks.film_cameras import Chosen, Shot, shots, take, without_telemetry
+from egopose.benchmarks.film_cameras import (
+    Chosen,
+    Shot,
+    motion_of,
+    read_exactly,
+    shots,
+    take,
+    without_telemetry,
+)
 from egopose.benchmarks.film_clips import CLIPS, SECONDS, bench_clip, bent, looped, on_the_spot, turns
 from egopose.benchmarks.film_confidence import Judged, areas, features
 from egopose.benchmarks.film_measures import area_interval, measures, share_in_order, step_frequency_of_legs
@@ -87,7 +95,7 @@ def test_a_loop_goes_on_without_a_jump_and_straight_on(name: str, humanoid: Huma
     assert jumps.max() < 3.0 * np.quantile(jumps, 0.95)
     path, heading = path_of(qpos)
     way = path[-1] - path[0]
-    assert np.linalg.norm(way) > 0.9 * speeds(qpos).sum() / FPS * (0.8 if name == "slow" else 1.0)
+    assert np.linalg.norm(way) > 0.9 * speeds(qpos).sum() / FPS
     assert abs(heading[-1] - heading[0]) < 0.4
 
 
@@ -105,7 +113,7 @@ def test_clips_do_what_their_names_say(humanoid: HumanoidModel) -> None:
     assert speeds(clips["standing"]).max() < 0.06
     assert speeds(clips["standing"]).mean() > 0.001
     mean = {name: speeds(clips[name]).mean() for name in ("walk", "brisk", "slow")}
-    assert mean["slow"] < 0.6 < 1.2 < mean["walk"] < mean["brisk"]
+    assert mean["slow"] < 1.1 < 1.3 < mean["walk"] < mean["brisk"]
 
 
 def test_no_clip_of_the_bench_is_data_to_train_on() -> None:
@@ -248,3 +256,11 @@ def test_a_small_camera_from_end_to_end(capsys: pytest.CaptureFixture) -> None:
     lines = tables(result).splitlines()
     assert lines[0] == "## Cameras"
     assert lines[4].startswith("| 20 | 90 | no | yes | 1 |")
+
+
+def test_a_camera_known_exactly_gives_the_walk(humanoid: HumanoidModel, walk: Array) -> None:
+    told = measures(humanoid, motion_of(humanoid, read_exactly(humanoid, walk, 20.0)), walk)
+    assert told["speed"] == pytest.approx(1.0, abs=0.1)
+    assert told["yaw_r"] > 0.9
+    assert told["step_error"] < 0.1
+    assert told["heading_degrees"] < 10.0

@@ -19,7 +19,7 @@ import torch
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from egopose.benchmarks.film_cameras import Chosen, Shot, read_film, shots, take, without_telemetry
+from egopose.benchmarks.film_cameras import Chosen, Shot, read_exactly, read_film, shots, take, without_telemetry
 from egopose.benchmarks.film_clips import SECONDS, bench_clip
 from egopose.benchmarks.film_confidence import BAD, Judged, areas, bad_films, judged, separation, shuffled_films
 from egopose.benchmarks.film_measures import measures
@@ -71,7 +71,7 @@ def run(overrides: Sequence[str], rounds: int) -> dict[str, Any]:
             films = _clips(humanoid, chosen, "confidence" in parts, folder)
             good = [film for film in films if film.row["kind"] == "good"]
             # Good films of other lenses only stand beside bad ones.
-            result["clips"] = [film.row for film in good if film.row["clip"]]
+            result["clips"] = [*_exact(humanoid, chosen), *(film.row for film in good if film.row["clip"])]
             result["by_clip"] = by_clip(result["clips"])
             if "confidence" in parts:
                 result["confidence"] = [film.row for film in films]
@@ -116,6 +116,16 @@ def _clips(humanoid: HumanoidModel, chosen: Chosen, with_bad: bool, folder: Path
                 shot = replace(usual, place=place, seed=number)
                 films += bad_films(humanoid, shot, chosen.seconds, folder, advance)
     return films
+
+
+def _exact(humanoid: HumanoidModel, chosen: Chosen) -> list[dict[str, Any]]:
+    """A row for each motion as it would be read if the camera's motion were known: ``imu`` is ``exact``."""
+    pitch, rows = _usual(chosen.pitch, _PITCH), []
+    for clip in chosen.clip:
+        qpos = _piece(bench_clip(clip, humanoid), chosen.seconds)
+        film = judged(humanoid, read_exactly(humanoid, qpos, pitch), qpos)
+        rows.append({"clip": clip, "pitch": pitch, "imu": "exact", **film.row})
+    return rows
 
 
 def _read(

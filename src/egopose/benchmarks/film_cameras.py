@@ -9,16 +9,22 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 
 from egopose.benchmarks.film_clips import CLIPS
+from egopose.checkpoint.head_signal import load_head_signal_regressor
 from egopose.core.errors import InputError
 from egopose.humanoid.model import HumanoidModel
 from egopose.inference.film_states import FilmReading, read_states
+from egopose.models.head_path import path_of_signal, standing_height, states_on_path
+from egopose.models.head_signal_input import signal_features
 from egopose.models.pose_regression import pose_regression
 from egopose.motion.rotations import Array
 from egopose.vision.containers import boxes, inside_box
 from egopose.vision.head_film import WornCamera, film_camera, head_rows, telemetry_of
+from egopose.vision.head_signal import signal_of_motion
 from egopose.vision.lens import Camera
+from egopose.vision.mounts import camera_poses, mount_of
 from egopose.vision.telemetry.track import is_telemetry
 from egopose.vision.virtual_gopro import FilmSettings, film
 
@@ -161,6 +167,22 @@ def read_film(humanoid: HumanoidModel, path: Path, camera: Camera) -> FilmReadin
     known, _ = film_camera(path, camera, telemetry)
     rows = list(head_rows(path, 1.0 / humanoid.control_dt, 0.0, known, telemetry))
     return read_states(humanoid, rows, path, camera, worn)
+
+
+@torch.no_grad()
+def read_exactly(humanoid: HumanoidModel, qpos: Array, pitch: float) -> FilmReading:
+    """What a film of a motion ``[T, nq]`` would tell if the camera's motion were known without error.
+
+    ``pitch`` is in degrees. What is wrong with the result is no fault of film.
+    """
+    fps, worn = 1.0 / humanoid.control_dt, WornCamera()
+    mount = mount_of(worn.mount, 0.0, float(np.deg2rad(pitch)), 0.0)
+    signal = signal_of_motion(*camera_poses(humanoid.mj_model, qpos, mount), fps)
+    height = standing_height(humanoid, worn.mount)
+    told = load_head_signal_regressor(humanoid).from_features(signal_features(signal, worn.mount)[None])
+    states = told["humanoid_state"][0].numpy()
+    placed = states_on_path(states, path_of_signal(signal, states, height, fps), fps)
+    return FilmReading(signal, torch.from_numpy(placed).float(), height, ())
 
 
 def motion_of(humanoid: HumanoidModel, reading: FilmReading) -> Array:

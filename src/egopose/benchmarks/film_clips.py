@@ -1,7 +1,8 @@
 """The motions of ``egopose bench film``: people whom no weights saw, on the humanoid, made long by loops and bends.
 
 The clips are in ``assets/bench``. A recorded walk crosses a room in three seconds. Here a cycle of it is looped, and
-its path is bent by a smooth yaw rate, so that walks are long and turn. Standing is one recorded pose that sways.
+its path is bent by a smooth yaw rate, so that walks are long and turn. Slow ones are recorded walks played slowly, and
+standing is one recorded pose that sways.
 """
 
 from __future__ import annotations
@@ -27,9 +28,9 @@ _FPS = 30.0
 _SOURCES = {
     "walk": "cmu35_walking_6",
     "brisk": "cmu10_04",
-    "slow": "cmu131_02",
+    "slow": "cmu10_04",
     "standing": "cmu131_02",
-    "turning": "cmu131_02",
+    "turning": "cmu10_04",
 }
 # Frames of a cycle, at least and at most: 0.7 s is a quick stride, 3 s are some slow ones.
 _SHORTEST, _LONGEST = 20, 90
@@ -37,6 +38,8 @@ _SHORTEST, _LONGEST = 20, 90
 _EDGE = 8
 # s from start to end of a turn by 90 degrees, and of the Gaussian that rounds it.
 _TURN, _ROUNDING = 1.5, 0.2
+# Of the recorded speed: the slow walk's, and that of the steps of who turns on the spot.
+_SLOWED = {"slow": 0.7, "turning": 0.6}
 # Quiet standing sways as a pendulum about the ankles, 0.2 to 0.5 Hz, by half a degree (Winter 1995); breath lifts the
 # chest 15 times a minute.
 _SWAY, _SWAY_HZ = np.deg2rad([0.35, 0.5]), (0.23, 0.31)
@@ -57,7 +60,7 @@ def bench_clip(name: str, humanoid: HumanoidModel) -> Array:
     seconds = SECONDS[name]
     if name == "standing":
         return standing(motion, seconds)
-    qpos = looped(motion.qpos, seconds)
+    qpos = looped(motion.resample(_FPS / _SLOWED.get(name, 1.0)).qpos, seconds)
     times = np.arange(len(qpos)) / _FPS
     if name == "walk":
         return bent(qpos, turns(times, ((0.25 * seconds, 90.0), (0.75 * seconds, -90.0))))
