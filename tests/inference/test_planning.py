@@ -29,7 +29,7 @@ from egopose.envs.problem import Followed, global_frame
 from egopose.envs.starts import Piece
 from egopose.envs.transforms import StateNormalizer
 from egopose.evaluation.agents import estimate_and_judge
-from egopose.inference.estimator import Estimate, estimate_takes
+from egopose.inference.estimator import Estimate, estimate_takes, restart_path
 from egopose.inference.failsafe import FailSafe, FailSafeSettings
 from egopose.inference.planner import Planner
 from egopose.inference.planner_settings import PlannerSettings, planner_settings
@@ -95,11 +95,12 @@ def planner_for(
     states: Tensor,
     policy: TensorDictModule | None = None,
     env: dict[str, Any] | None = None,
+    path: Tensor | None = None,
     **changed: Any,
 ) -> Planner:
     chosen = settings(**{**SMALL, **changed})
     copies = frozen(make_env(num_envs * chosen.samples, **(env or {})))
-    return Planner(copies, policy or actor(), critic(), chosen, Followed(states, global_frame))
+    return Planner(copies, policy or actor(), critic(), chosen, Followed(states, global_frame, path))
 
 
 def leaning(env: TransformedEnv, steps: int = 3) -> EgoPoseEnv:
@@ -547,9 +548,13 @@ def estimated_by(planner: PlannerSettings | None, made: Callable[[], None] = lam
 
 def test_an_evaluation_plans_only_where_it_is_told_to() -> None:
     states = states_of(other_motion())
+    problem = base_of(make_env(1)).problem
+    problem.states = states  # type: ignore[attr-defined]
+    path = problem.followed().path
+    assert path is not None
     for planned, by_hand in (
         (None, run(None, states, actor())),
-        (settings(**SMALL), run(planner_for(2, states), states, actor())),
+        (settings(**SMALL), run(planner_for(2, states, path=path), states, actor())),
     ):
         for one, two in zip(estimated_by(planned), by_hand, strict=True):
             np.testing.assert_array_equal(one.qpos, two.qpos)
@@ -598,9 +603,9 @@ def path_reward(weight: float) -> dict[str, Any]:
     return {**table, "terms": {**table["terms"], **ours}}
 
 
-def planner_on(path: Tensor | None, reward: dict[str, Any], seed: int = 0) -> Planner:
+def planner_on(path: Tensor | None, reward: dict[str, Any], seed: int = 0, place_time: float = np.inf) -> Planner:
     changes = {"samples": 32, "horizon": 12, "every": 6, "deviation": 0.4, "acceleration": 0.0, "margin": 0.0}
-    chosen = settings(**{**SMALL, **changes, "place_time": np.inf, "reward": reward, "seed": seed})
+    chosen = settings(**{**SMALL, **changes, "place_time": place_time, "reward": reward, "seed": seed})
     copies, states = frozen(make_env(2 * chosen.samples)), states_of(true_motion()[0])
     return Planner(copies, passive(), critic(), chosen, Followed(states, global_frame, path))
 
@@ -630,7 +635,7 @@ def strayed(path: Tensor, weight: float, seed: int) -> tuple[float, float]:
 @pytest.mark.parametrize(("path", "number", "share"), [(along(turn=np.pi / 2), 0, 0.75), (along(x=1.0), 1, 0.96)])
 def test_a_body_keeps_closer_to_a_path_that_counts(path: Tensor, number: int, share: float) -> None:
     # A body that stands and sways, and is to turn by 90 degrees a second, or to go a metre a second.
-    without, with_it = (np.mean([strayed(path, weight, seed)[number] for seed in (0, 1)]) for weight in (0.0, 5.0))
+    without, with_it = (np.mean([strayed(path, weight, seed)[number] for seed in (0, 1)]) for weight in (0.0, 20.0))
     assert with_it < share * without
 
 
@@ -666,6 +671,24 @@ def test_the_path_is_chosen_by_and_no_part_of_the_value() -> None:
         way = torch.stack([facing.cos(), facing.sin()], dim=-1) * passed
         expected += 0.99**step * 2.0 * path_terms(turn, qpos[:, :2] - begin[:, :2] - way)
     torch.testing.assert_close(gained[5], expected.float(), rtol=0, atol=1e-4)
+
+
+def test_a_planned_body_restarts_on_the_planners_path_as_it_lies_by_then() -> None:
+    path, states = along(x=2.0, turn=0.5), states_of(true_motion()[0])
+    planner = planner_on(path, path_reward(1.0), place_time=0.5)
+    guard = FailSafe(2, FailSafeSettings("naive", 0.6, fallen_height=9.0, restart="path"))  # at every frame
+    env = make_env(2)
+    restart = restart_path("path", env, planner)
+    assert restart is planner.path
+    estimates = estimate_takes(env, passive(), critic(), states, guard, planner=planner, restart=restart)
+    for number, one in enumerate(estimates):
+        assert one.resets[1:].all()
+        own = path[number * FRAMES : (number + 1) * FRAMES].numpy()
+        # Placed on the path at each frame, the body is where the path is: there is nothing to draw the path by.
+        facing = rot.yaw(torch.from_numpy(one.qpos[:, 3:7])).numpy()
+        np.testing.assert_allclose(np.cos(facing - facing[0] - own[:, 2]), 1.0, atol=1e-9)
+        straight = one.qpos[0, :2] + own[:, :1] * np.array([np.cos(facing[0]), np.sin(facing[0])])
+        np.testing.assert_allclose(one.qpos[:, :2], straight, atol=1e-9)
 
 
 def test_what_has_no_path_is_planned_for_as_without_its_terms() -> None:

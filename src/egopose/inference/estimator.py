@@ -21,6 +21,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from egopose.core.errors import InputError
 from egopose.envs.env import EgoPoseEnv
+from egopose.envs.mdp import rotations as torch_rotations
 from egopose.envs.test_time import Controller, prepare_for_test
 from egopose.humanoid.foot_geometry import out_of_floor
 from egopose.humanoid.model import HumanoidModel
@@ -148,6 +149,10 @@ def estimate_takes(
                 observation["action"] = observation["action"] + planner.perturbation(base)
                 value = planner.value
             triggered = guard.update(value, body["xpos"][:, base.problem.humanoid.head, 2], t < lengths)
+            if restart is not None:
+                now = restart.at((start + t).clamp(max=len(states) - 1))
+                facing = torch_rotations.yaw(body["qpos"][:, 3:7])
+                triggered |= (t < lengths) & guard.strayed(body["qpos"][:, :2], facing, *now)
             frame = (body["qpos"], value, triggered, placed, observation["fallen"].squeeze(-1), diverged)
             for name, column in zip(rows, frame, strict=True):
                 rows[name].append(column)

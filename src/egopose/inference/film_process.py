@@ -264,6 +264,8 @@ def _work(settings: FilmSettings, answers: Any, orders: Any) -> None:
     end_with_parent()
     # Software OpenGL draws in the thread that asks: two panels are two threads already.
     os.environ.setdefault("LP_NUM_THREADS", "0")
+    # OpenCV's own threads share out a picture and wait for each other busily: DIS costs twice as much with two.
+    cv2.setNumThreads(1)
     opengl = threading.Thread(target=_find_opengl, daemon=True)
     opengl.start()
     try:

@@ -14,7 +14,7 @@ from egopose.checkpoint.head_signal import load_head_signal_regressor
 from egopose.core.errors import InputError
 from egopose.humanoid.model import HumanoidModel
 from egopose.inference.video_regression import crossed
-from egopose.models.head_path import path_of_signal, standing_height, states_on_path
+from egopose.models.head_path import camera_height, path_of_signal, states_on_path
 from egopose.models.head_signal_input import signal_features
 from egopose.models.regressor import StateRegressor
 from egopose.pipeline.regressor import joint_targets
@@ -65,7 +65,7 @@ def read_states(
     regressor = load_head_signal_regressor(humanoid)
     features = signal_features(signal, worn.mount)
     states = regressor.from_features(features[None])["humanoid_state"][0]
-    height = standing_height(humanoid, worn.mount) if worn.height is None else worn.height
+    height = camera_height(humanoid, worn.mount) if worn.height is None else worn.height
     path = path_of_signal(signal, states.numpy(), height, fps)
     notes = []
     if guessed:
@@ -77,16 +77,11 @@ def read_states(
     return FilmReading(signal, placed, height, tuple(notes))
 
 
-def seen_in_film(
-    humanoid: HumanoidModel, reading: FilmReading, regressor: StateRegressor, source_config: Mapping[str, Any]
-) -> dict[str, Tensor]:
-    """As :func:`egopose.inference.video_regression.seen_in`, of a film's reading.
+def require_states_for_context(source_config: Mapping[str, Any]) -> None:
+    """See that a policy can be told what a head signal says; to be called before the film is read.
 
     Args:
-        humanoid: the run's.
-        reading: of the film.
-        regressor: the run's own, in whose units the policy reads its context.
-        source_config: the groups it was trained with.
+        source_config: the groups that the run's regressor was trained with.
 
     Raises:
         InputError: the policy reads the flow's own context, which a head signal does not have.
@@ -94,6 +89,16 @@ def seen_in_film(
     if not crossed(source_config):
         cause = "the policy reads the context of its own regressor of flow: sees=flow"
         raise InputError("conf/estimate.yaml", "sees", cause)
+
+
+def seen_in_film(humanoid: HumanoidModel, reading: FilmReading, regressor: StateRegressor) -> dict[str, Tensor]:
+    """As :func:`egopose.inference.video_regression.seen_in`, of a film's reading.
+
+    Args:
+        humanoid: the run's.
+        reading: of the film.
+        regressor: the run's own, in whose units the policy reads its context (:func:`require_states_for_context`).
+    """
     return {
         "visual_context": regressor.normalise(reading.states),
         "humanoid_state": reading.states,

@@ -24,7 +24,7 @@ from egopose.envs.mdp.observations import humanoid_state
 from egopose.envs.problem import TakeTable
 from egopose.humanoid.state_layout import StateLayout
 from egopose.inference.context_states import context_states
-from egopose.inference.estimator import estimate_takes
+from egopose.inference.estimator import estimate_takes, restart_path
 from egopose.inference.failsafe import FailSafe, FailSafeSettings
 from egopose.inference.video_regression import require_estimation, run_folder, seen_in
 from egopose.models.predictions import Flow
@@ -95,7 +95,8 @@ def _estimated(
     policy = load_agent(checkpoint, dataset)
     env = policy.make_env(num_envs=len(first), threads=threads, whole_fragments=True, falls_end=False)
     guard = FailSafe(len(first), failsafe.for_run(policy.config))
-    estimates = estimate_takes(env, policy.actor, policy.critic, policy.followed_states(), guard)
+    restart = restart_path(failsafe.restart, env, None)
+    estimates = estimate_takes(env, policy.actor, policy.critic, policy.followed_states(), guard, restart=restart)
     env.close()
     clips = seen["humanoid_state"].double().unflatten(0, (len(first), context))
     fps = 1.0 / humanoid.control_dt

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
 import sys
 from collections.abc import Mapping
 from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +23,7 @@ from egopose.inference.estimator import estimate_takes, restart_path
 from egopose.inference.failsafe import FailSafe, FailSafeSettings
 from egopose.inference.film_agreement import film_agreement
 from egopose.inference.film_process import Drawing, FilmProcess, FilmSettings, was_rendered
-from egopose.inference.film_states import FilmReading, read_states, seen_in_film
+from egopose.inference.film_states import FilmReading, read_states, require_states_for_context, seen_in_film
 from egopose.inference.outputs import TakeVideo, write_footage, write_motion_files
 from egopose.inference.planner import Planner
 from egopose.inference.planner_settings import PlannerSettings, planned_threshold, planner_settings
@@ -76,6 +78,9 @@ def run_estimate(
     """
     failsafe = from_mapping(FailSafeSettings, config["failsafe"], "conf/estimate.yaml: failsafe")
     settings = allowed_planner(config)
+    if settings is not None and reading is not None:
+        # A head signal does not drift as the states' own velocities do: its path stays where it was laid.
+        settings = replace(settings, place_time=math.inf, heading_time=math.inf)
     guard = FailSafe(1, failsafe.for_run(agent.config, planned_threshold(settings)))
     torch.set_num_threads(1)
     options = {"threads": 1, "whole_fragments": True, "falls_end": False}
@@ -108,8 +113,8 @@ def run_estimate(
     write_motion_files(out, "estimate", motion)
     columns = estimate.columns()
     agreement = None
-    if reading is not None:
-        agreement = film_agreement(humanoid, motion.qpos, reading, str(config["worn"]["mount"]))
+    if reading is not None and film.settings.worn is not None:
+        agreement = film_agreement(humanoid, motion.qpos, reading, film.settings.worn.mount)
         columns |= agreement.columns()
     write_columns_csv(out / "frames.csv", columns)
     write_footage(out, seen, 0, motion.fps)
@@ -187,6 +192,8 @@ def estimate_video(values: Mapping[str, Any], foreseen: FilmProcess | None = Non
         regressor, source_config = load_regressor(run_folder(checkpoint) / "regressor")
         lookahead = allowed_lookahead(values)
         settings = FilmSettings.of(values, source_config, 1.0 / humanoid.control_dt)
+        if settings.worn is not None:
+            require_states_for_context(source_config)
         finder = load_body_part_estimator_of(source_config["regressor"])
         info = probe_video(video)
         seconds = info.frames / (settings.camera.fps or info.fps) - settings.offset
@@ -202,7 +209,7 @@ def estimate_video(values: Mapping[str, Any], foreseen: FilmProcess | None = Non
         with progress.stage(SEEING):
             if settings.worn is not None:
                 reading = read_states(humanoid, rows, video, settings.camera, settings.worn)
-                seen = seen_in_film(humanoid, reading, regressor, source_config)
+                seen = seen_in_film(humanoid, reading, regressor)
             else:
                 warn_of_film(video, finder is not None)
                 flow = np.stack([row[0] for row in rows])

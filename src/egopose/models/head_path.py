@@ -24,17 +24,19 @@ _SLOW_TURN, _SLOW_MOVE = 0.6, 0.7
 # Below the first number nothing moves, above the second all of it counts: m/s, and rad/s (2 and 5 degrees/s). Errors of
 # a standing person's signal lie below.
 _STANDS, _STANDING_TURN = (0.06, 0.14), (0.035, 0.09)
+#: Of a body that stands straight: CMU's walkers carry their heads so much lower.
+_WALKING_HEIGHT = 0.97
 #: s over which it is decided whether somebody stands.
 _DECISION = 0.5
 _UP = np.array([0.0, 0.0, 1.0])
 
 
-def standing_height(humanoid: HumanoidModel, mount: str) -> float:
-    """m above the floor of a camera on a humanoid that stands straight on it."""
+def camera_height(humanoid: HumanoidModel, mount: str) -> float:
+    """m above the floor of a camera that a humanoid wears while it walks."""
     pose = humanoid.mj_model.qpos0[None].copy()
     soles = sole_positions(humanoid, Motion(humanoid.skeleton, pose, 1.0 / humanoid.control_dt))
     positions, _ = camera_poses(humanoid.mj_model, pose, mount_of(mount))
-    return float(positions[0, 2] - soles[..., 2].min())
+    return _WALKING_HEIGHT * float(positions[0, 2] - soles[..., 2].min())
 
 
 def path_of_signal(signal: HeadSignal, states: Array, height: float, fps: float) -> Array:
@@ -43,7 +45,7 @@ def path_of_signal(signal: HeadSignal, states: Array, height: float, fps: float)
     Args:
         signal: of T frames.
         states: ``[T, S]`` what a regressor makes of them.
-        height: m of the camera above the floor while standing.
+        height: m of the camera above the floor.
         fps: frames/s.
     """
     quick = integrated_path(states, fps)
@@ -54,6 +56,7 @@ def path_of_signal(signal: HeadSignal, states: Array, height: float, fps: float)
     seen = _turned(signal.velocity[:, :2] * height, facing)
     own = np.zeros_like(seen)
     own[:-1] = _turned(_turned(np.diff(quick[:, :2], axis=0) * fps, -quick[:-1, 2]), heading[:-1])
+    own[-1:] = own[-2:-1]  # the last state leads nowhere: as zero it would be a stop that the filter spreads
     weight = gaussian_filter1d(signal.quality[:, 1], _SLOW_MOVE * fps, mode="nearest")[:, None]
     kept = gaussian_filter1d(signal.quality[:, 1:] * (seen - own), _SLOW_MOVE * fps, axis=0, mode="nearest")
     velocity = own + kept / np.maximum(weight, 0.05)

@@ -27,7 +27,7 @@ from egopose.motion import rotations as rot
 from egopose.motion.motion import finite_difference
 from egopose.motion.rotations import Array
 from egopose.vision.head_signal import signal_of_motion
-from egopose.vision.mounts import MOUNTS, camera_poses, held_sway, mount_of
+from egopose.vision.mounts import MOUNTS, Mount, camera_poses, held_sway, mount_of
 
 Range = tuple[float, float]
 _LEAST = 8  # frames of a clip below which there is nothing to learn
@@ -123,11 +123,30 @@ def draw_examples(
             sway, shifts = held_sway(rng, len(qpos), fps)
             angles = angles + sway
         mount = mount_of(kind, float(yaw), float(pitch), float(roll))
-        positions, turned = camera_poses(humanoid.mj_model, qpos, mount, angles, shifts)
-        features = signal_features(signal_of_motion(positions, turned, fps), kind)
-        states = torch.from_numpy(humanoid_state_rows(qpos, finite_difference(qpos, fps))).float()
-        examples.append(Example(features, states))
+        examples.append(exact_example(humanoid, qpos, fps, mount, angles, shifts))
     return examples
+
+
+def exact_example(
+    humanoid: HumanoidModel,
+    qpos: Array,
+    fps: float,
+    mount: Mount,
+    angles: Array | None = None,
+    shifts: Array | None = None,
+) -> Example:
+    """What a camera on ``mount`` would measure without an error.
+
+    Args:
+        humanoid: whose motion it is.
+        qpos: ``[T, nq]``.
+        fps: frames/s.
+        mount, angles, shifts: see :func:`egopose.vision.mounts.camera_poses`.
+    """
+    positions, turned = camera_poses(humanoid.mj_model, qpos, mount, angles, shifts)
+    features = signal_features(signal_of_motion(positions, turned, fps), mount.kind)
+    states = torch.from_numpy(humanoid_state_rows(qpos, finite_difference(qpos, fps))).float()
+    return Example(features, states)
 
 
 def paced(qpos: Array, pace: float) -> Array:

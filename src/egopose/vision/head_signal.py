@@ -30,10 +30,13 @@ _NO_FLOOR, _FLOOR = 0.05, 0.30
 #: Cells across the picture in which flow is fitted; more cost time and do not help.
 _CELLS = 24
 #: rad, the pitches among which a film's is looked for, and what is taken where nobody walks.
-_PITCHES = np.deg2rad(np.arange(-15.0, 61.0, 5.0))
+_PITCHES = np.deg2rad(np.arange(-15.0, 61.0, 15.0))
+_HALVINGS = 2  # of the step between them, where the right one lies
 USUAL_PITCH = float(np.deg2rad(20.0))
 #: Frames of a film that are looked at for its pitch.
 _PITCH_FRAMES = 240
+# s over which gyroscope and picture are compared, how strictly, and rad/s that count for nothing.
+_AGREEMENT, _STRICT, _STILL = 1.0, 5.0, 0.05
 #: Slow frames that are enough to know a gyroscope's bias.
 _SLOW_FRAMES = 15
 #: Heights a second: the mean speed below which a film tells nothing of its pitch.
@@ -137,11 +140,11 @@ def signal_of_flow(
     fit = fit_ground_motion(moved, rays, down, fps)
     turn, turn_quality = fit.turn, 1.0 / (1.0 + (fit.turn_deviation * fps / _DOUBTFUL_TURN) ** 2)
     if turning is not None:
-        turn_quality = np.ones(len(moved))
         if steadied_picture:
-            turn = turning * seconds
+            turn, turn_quality = turning * seconds, np.ones(len(moved))
         else:
             turn = without_bias(turning * seconds, fit, known)
+            turn_quality = turns_agree(turn, fit, fps)
             fit = fit_ground_motion(moved, rays, down, fps, turn)
     axes = gravity_axes(steadied(down, fps))
     quality = np.stack([turn_quality, velocity_quality(fit, fps), fit.rigid], axis=1)
@@ -190,6 +193,17 @@ def _cross(d: Array) -> Array:
     return np.array([[0.0, d[2], -d[1]], [-d[2], 0.0, d[0]], [d[1], -d[0], 0.0]])
 
 
+def turns_agree(turn: Array, seen: GroundMotion, fps: float) -> Array:
+    """``[T]`` in 0..1: 1 where the picture turns as the gyroscope says, over a second; 0 where it does not.
+
+    A lens that is not the film's turns the picture too fast or too slowly.
+    """
+    apart, both = (np.square(v).sum(1) for v in (turn - seen.turn, np.concatenate([turn, seen.turn], axis=1)))
+    window = _AGREEMENT * fps
+    apart, both = (gaussian_filter1d(v, window, mode="nearest") for v in (apart, both))
+    return np.clip(1.0 - _STRICT * apart / (both + 2 * (_STILL / fps) ** 2), 0.0, 1.0)
+
+
 def down_from_turning(turn: Array, pitch_down: float, fps: float) -> Array:
     """Unit vectors down ``[T, 3]`` of a camera that turns ``[T, 3]`` (rad a frame) and has that mean pitch (rad).
 
@@ -222,19 +236,34 @@ def pitch_of_film(moved: Array, rays: Array, fps: float) -> float:
     """
     chosen = np.unique(np.linspace(1, len(moved) - 1, min(_PITCH_FRAMES, max(len(moved) - 1, 1))).astype(int))
     chosen = chosen[chosen < len(moved)]
-    rises, speeds = [], []
-    for pitch in _PITCHES:
-        down = np.broadcast_to(down_of(float(pitch), 0.0), (len(chosen), 3))
+
+    def walk(pitch: float) -> tuple[float, float]:
+        """How much walking ahead rises with that pitch, and the mean speed ahead."""
+        down = np.broadcast_to(down_of(pitch, 0.0), (len(chosen), 3))
         fit = fit_ground_motion(moved[chosen], rays, down, fps)
         velocity = _in(gravity_axes(down), fit.velocity) * fps
         weight = velocity_quality(fit, fps)
         ahead = velocity[:, 0] * weight
-        speeds.append(float(ahead.sum() / max(weight.sum(), 1e-9)))
-        rises.append(float((velocity[:, 2] * ahead).sum() / max((ahead**2).sum(), 1e-12)))
-    best = zero_crossing(_PITCHES, np.array(rises))
-    if best is None or np.interp(best, _PITCHES, speeds) < _WALKS:
+        speed = float(ahead.sum() / max(weight.sum(), 1e-9))
+        return float((velocity[:, 2] * ahead).sum() / max((ahead**2).sum(), 1e-12)), speed
+
+    found = {float(pitch): walk(float(pitch)) for pitch in _PITCHES}
+    for _ in range(_HALVINGS):
+        best = _crossing_of(found)
+        if best is None:
+            return USUAL_PITCH
+        below, above = (max(p for p in found if p <= best), min(p for p in found if p >= best))
+        found[0.5 * (below + above)] = walk(0.5 * (below + above))
+    best = _crossing_of(found)
+    at = np.array(sorted(found))
+    if best is None or np.interp(best, at, [found[pitch][1] for pitch in at]) < _WALKS:
         return USUAL_PITCH
     return best
+
+
+def _crossing_of(found: dict[float, tuple[float, float]]) -> float | None:
+    at = np.array(sorted(found))
+    return zero_crossing(at, np.array([found[pitch][0] for pitch in at]))
 
 
 def zero_crossing(at: Array, values: Array) -> float | None:
