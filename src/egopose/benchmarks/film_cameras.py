@@ -16,7 +16,7 @@ from egopose.checkpoint.head_signal import load_head_signal_regressor
 from egopose.core.errors import InputError
 from egopose.humanoid.model import HumanoidModel
 from egopose.inference.film_states import FilmReading, read_states
-from egopose.models.head_path import path_of_signal, standing_height, states_on_path
+from egopose.models.head_path import camera_height, path_of_signal, states_on_path
 from egopose.models.head_signal_input import signal_features
 from egopose.models.pose_regression import pose_regression
 from egopose.motion.rotations import Array
@@ -178,7 +178,7 @@ def read_exactly(humanoid: HumanoidModel, qpos: Array, pitch: float) -> FilmRead
     fps, worn = 1.0 / humanoid.control_dt, WornCamera()
     mount = mount_of(worn.mount, 0.0, float(np.deg2rad(pitch)), 0.0)
     signal = signal_of_motion(*camera_poses(humanoid.mj_model, qpos, mount), fps)
-    height = standing_height(humanoid, worn.mount)
+    height = camera_height(humanoid, worn.mount)
     told = load_head_signal_regressor(humanoid).from_features(signal_features(signal, worn.mount)[None])
     states = told["humanoid_state"][0].numpy()
     placed = states_on_path(states, path_of_signal(signal, states, height, fps), fps)
