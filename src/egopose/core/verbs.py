@@ -35,4 +35,5 @@ BENCHMARKS = {
     "stream": 1,
     "plan": 9,
     "estimate": 3,
+    "film": 2,
 }
