@@ -24,7 +24,8 @@ NOTEBOOK = "notebooks/first_look.ipynb"
 API = {
     "motion": "motion rotations skeleton kinematics mapping retarget contacts ground io",
     "humanoid": "config model from_motion physics boxes state_layout",
-    "vision": "video flow lens camera_rotation features encoders rendering rooms takes body_parts body_part_pictures",
+    "vision": "video flow lens head_signal head_film camera_rotation features encoders rendering rooms takes "
+    "body_parts body_part_pictures",
     "data": "take_sources preparation prepare_motion sync_offset store splits feasibility gate",
     "models": "policy context episode_context regressor pose_regression predictions mirror",
     "envs": "imitation problem env dm_control_task starts transforms "

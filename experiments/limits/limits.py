@@ -44,7 +44,8 @@ from egopose.training.blended_regressor import (
 )
 from egopose.vision.body_part_pictures import BODIES, posture_in
 from egopose.vision.body_parts import LOG_VARIANCE, BodyPartEstimator
-from egopose.vision.rendering import WEARER_CAMERA, camera_orientations, worn_camera
+from egopose.vision.mounts import WEARER_CAMERA, camera_orientations
+from egopose.vision.rendering import worn_camera
 from egopose.vision.takes import RenderConfig, take_seed
 
 HERE = Path(__file__).resolve().parent

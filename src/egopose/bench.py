@@ -7,9 +7,11 @@ scaling: the cost of every part of an iteration, and the memory of workers that 
 sync: the accuracy of offsets between motions and videos.
 stream: live estimation: frames a second, latency by stage, late frames, memory.
 plan: the planner at test time beside its bare physics.
+estimate: the command `egopose estimate` on a film, beside the film's own length.
 resume: a training killed at random moments beside the same one left alone.
 retarget: frames a second of retargeting to the humanoid, on one core.
 export: what every export format loses, by independent readers.
+film: estimates from rendered films against the true motion, by cameras; whether bad films are told.
 """
 
 from __future__ import annotations
@@ -21,6 +23,7 @@ from collections.abc import Sequence
 from importlib import import_module
 
 from egopose.core.errors import InputError
+from egopose.core.result_files import finite_or_null
 from egopose.core.verbs import BENCHMARKS
 
 
@@ -46,7 +49,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
         print(f"error: {error}", file=sys.stderr)
         raise SystemExit(2) from None
     if options.json:
-        print(json.dumps(result))
+        print(json.dumps(finite_or_null(result), allow_nan=False))
+        return
+    if hasattr(verb, "tables"):
+        print(verb.tables(result))
         return
     for name, value in result.items():
         print(f"{name:22s} {value:.3f}" if isinstance(value, float) else f"{name:22s} {value}")

@@ -8,15 +8,23 @@ from omegaconf import DictConfig
 
 from egopose.core.config import command, resolved
 from egopose.core.errors import InputError
+from egopose.core.runtime import libraries_loading
 
 
 @command("estimate")
 def main(config: DictConfig) -> None:
     """Hydra's entry."""
-    from egopose.inference.video import estimate_video
+    from egopose.inference.film_process import foreseen_film
 
     try:
-        estimate_video(resolved(config))
+        values = resolved(config)
+        # Another process reads the film while this one imports torch and what stands on it.
+        film = foreseen_film(values)
+
+        with libraries_loading():
+            from egopose.inference.video import estimate_video
+
+        estimate_video(values, film)
     except InputError as error:
         print(f"error: {error}", file=sys.stderr)
         raise SystemExit(2) from None

@@ -183,8 +183,9 @@ def unknown_settings(text: str) -> list[str]:
     """``VERB key`` of the settings in a page's commands that the verb does not have."""
     blocks = "\n".join(re.findall(r"```bash\n(.*?)```", text, re.DOTALL)).replace("\\\n", " ")
     out = []
-    for verb, rest in re.findall(r"^(?:\w+=\S+ )*(?:egopose |python -m egopose\.)(\w+)(.*)$", blocks, re.MULTILINE):
-        name = "body_parts" if "--config-name body_parts" in rest else verb
+    for verb, rest in re.findall(r"^ *(?:\w+=\S+ )*(?:egopose |python -m egopose\.)(\w+)(.*)$", blocks, re.MULTILINE):
+        named = re.search(r"--config-name (\w+)", rest)
+        name = named[1] if named else verb
         if not (ROOT / "conf" / f"{name}.yaml").is_file():
             continue
         words = re.sub(r"'[^']*'|\"[^\"]*\"", lambda m: m[0].strip("'\"").replace(" ", ""), rest.partition(" #")[0])
@@ -209,7 +210,7 @@ def test_a_setting_that_is_not_there_is_found() -> None:
 @pytest.mark.parametrize("path", PAGES, ids=lambda p: p.name)
 def test_commands_in_the_docs_name_verbs_that_are_there(path: Path) -> None:
     blocks = re.findall(r"```bash\n(.*?)```", path.read_text(), re.DOTALL)
-    used = {verb for block in blocks for verb in re.findall(r"^egopose ([a-z]+)", block, re.MULTILINE)}
+    used = {verb for block in blocks for verb in re.findall(r"^ *egopose ([a-z]+)", block, re.MULTILINE)}
     assert used <= set(VERBS)
 
 

@@ -29,6 +29,8 @@ if kind == "motion":
 elif kind == "video":
     from egopose.vision.video import iter_frames, probe_video
     read = lambda path: (probe_video(path), sum(1 for _ in iter_frames(path)))
+elif kind == "telemetry":
+    from egopose.vision.telemetry import read_telemetry as read
 else:
     from egopose.core.safe_io import read_json
     read = lambda path: read_json(path, "x")

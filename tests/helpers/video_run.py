@@ -29,7 +29,17 @@ FRAMES = 20
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run directory with untrained networks and regressor."""
-    folder = tmp_path_factory.mktemp("run")
+    return make_run(tmp_path_factory.mktemp("run"))
+
+
+@pytest.fixture(scope="module")
+def crossed_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """As :func:`run`, of a policy that reads states for a context."""
+    return make_run(tmp_path_factory.mktemp("crossed_run"), cross_fit=2)
+
+
+def make_run(folder: Path, cross_fit: int = 1) -> Path:
+    """Write an untrained run to ``folder``."""
     config: dict[str, Any] = {
         "seed": 0,
         "task": {**group("task", "residual"), "horizon": 12, "minimum": 6},
@@ -37,7 +47,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
         "humanoid": group("humanoid", "default"),
         "sim": group("sim", "fast"),
         "vision": group("vision", "light"),
-        "regressor": group("regressor", "fast"),
+        "regressor": {**group("regressor", "fast"), "cross_fit": cross_fit},
         "model": {**group("model", "fast"), "hidden": [8]},
         "collector": {**COLLECTOR, "num_envs": 2},
         "algo": {**SETTINGS, "iterations": 1, "steps_per_iteration": 16},
@@ -65,5 +75,5 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def settings(video: Path, checkpoint: Path, **changed: Any) -> dict[str, Any]:
     failsafe = {"mode": "value", "reset_threshold": 0.6, "fallen_height": 0.3}
     values = {"which": "latest", "out": None, "offset": 0.0, "size": 64, "failsafe": failsafe}
-    values |= {"causal": False, "lookahead": 10, "camera": {}}
+    values |= {"causal": False, "lookahead": 10, "camera": {}, "sees": "flow", "worn": {}}
     return {"video": str(video), "checkpoint": str(checkpoint), **values, **changed}

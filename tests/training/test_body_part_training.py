@@ -22,12 +22,14 @@ from egopose.training.body_parts import (
     BodyPartSettings,
     BodyPartTraining,
     Pictures,
+    bodiless_figures,
     held_out_figures,
     posture_mirror,
     save_body_part_estimator,
     train_body_part_estimator,
     varied,
 )
+from egopose.vision.bodiless_pictures import KINDS
 from egopose.vision.body_part_pictures import posture_names
 from egopose.vision.body_parts import LIMBS, BodyPartEstimator
 from egopose.vision.flow import FlowConfig
@@ -164,12 +166,13 @@ def test_a_finder_is_kept_without_pickle_and_comes_back(
 
 def test_the_verb_draws_trains_keeps_and_does_nothing_twice(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     tiny = ["pictures.samples=24", "pictures.rooms_a_part=1", "pictures.wearings=2", "pictures.pairs=6", "workers=1"]
-    tiny += ["vision.room.texture_size=64", "training.held_out=0.25", "training.epochs=1"]
+    tiny += ["bodiless=2", "vision.room.texture_size=64", "training.held_out=0.25", "training.epochs=1"]
     values = compose_config("body_parts", [f"motions=['{WALK}']", f"out={tmp_path / 'out'}", *SMALL, *tiny])
     card = body_parts.make_body_part_estimator(values)
     assert (card["samples"], card["held_out"]) == (24, 6)
     assert list(card["motions"]) == [WALK.name]
     assert set(card["figures"]["masks"]) == set(LIMBS)
+    assert set(card["without a body"]) == set(KINDS)
     assert read_json(tmp_path / "out" / "finder", "card") == json.loads(json.dumps(card))
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["finder", "pictures"]
     monkeypatch.setattr(limb_finder, "train_body_part_estimator", lambda *_: pytest.fail("it is trained already"))
@@ -179,11 +182,29 @@ def test_the_verb_draws_trains_keeps_and_does_nothing_twice(tmp_path: Path, monk
         body_parts.make_body_part_estimator(values)
 
 
+def test_what_is_found_without_a_body_is_counted_as_false(
+    data: Pictures, skeleton: Skeleton, settings: BodyPartSettings, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    model = BodyPartTraining(data, skeleton, settings, seed=1).model
+
+    def seen(before: torch.Tensor, now: torch.Tensor, flow: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        masks = torch.full((len(now), 5, 32, 32), -9.0)
+        masks[:, 1, :16], masks[:, 4, 8:24] = 9.0, 9.0  # half of the picture each, a quarter in common
+        return masks, torch.zeros(len(now), 89), torch.log(torch.full((len(now), 89), 0.25))
+
+    monkeypatch.setattr(model, "forward", seen)
+    figures = bodiless_figures(model, data.pictures[:7], data.flow[:7], batch=3)
+    wanted = {"false": 0.75, **dict.fromkeys(LIMBS, 0.0), "left arm": 0.5, "trunk": 0.5, "variance": 0.25}
+    assert figures == pytest.approx(wanted)
+
+
 def test_settings_that_cannot_be_are_told(
     config: dict[str, Any], data: Pictures, skeleton: Skeleton, settings: BodyPartSettings
 ) -> None:
     for name, value in (("batch", 0), ("channels", 12), ("epochs", 0), ("held_out", 1.0)):
         with pytest.raises(InputError, match=f"training: {name}: must"):
             BodyPartSettings.from_config({**config["training"], name: value})
+    with pytest.raises(InputError, match="bodiless: must be at least 1"):
+        body_parts.make_body_part_estimator({**config, "bodiless": 0})
     with pytest.raises(InputError, match="batch: is 64, and there are 48"):
         BodyPartTraining(data, skeleton, replace(settings, batch=64), 1)

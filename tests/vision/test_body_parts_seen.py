@@ -41,9 +41,10 @@ from egopose.pipeline.regressor_input import (
 )
 from egopose.training import blended_regressor as blending
 from egopose.training.blended_regressor import KernelSettings
-from egopose.vision.body_parts import BodyPartEstimator, as_plane, body_part_rows, small_picture
+from egopose.vision.body_parts import BodyPartEstimator, as_plane, body_part_rows
 from egopose.vision.encoders import LightFlowEncoder
 from egopose.vision.features import extract_body_parts, extract_flow
+from egopose.vision.film import small_picture
 from egopose.vision.flow import FlowConfig
 from egopose.vision.lens import Camera
 from egopose.vision.video import iter_frames

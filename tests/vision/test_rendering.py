@@ -18,14 +18,15 @@ from scipy.spatial.transform import Rotation
 from egopose.core.errors import InputError
 from egopose.vision import gl
 from egopose.vision.features import extract_flow
+from egopose.vision.mounts import camera_orientations
 from egopose.vision.rendering import (
     SceneRenderer,
     WearerCamera,
-    camera_orientations,
     side_view_frames,
     wearer_frames,
 )
-from egopose.vision.rooms import draw_room, furnish, random_pattern, room_seed
+from egopose.vision.rooms import draw_room, furnish, room_seed
+from egopose.vision.surfaces import random_pattern
 from egopose.vision.takes import RenderConfig, RenderJob, is_rendered, render_takes
 from egopose.vision.video import probe_video, read_frames
 

@@ -74,7 +74,7 @@ def from_mapping(cls: type[T], values: Mapping[str, Any], source: str) -> T:
 
 
 def convert(value: Any, kind: Any, source: str, field: str) -> Any:
-    """``value`` as ``kind``: bool, int, float, str, tuples of them, any of them optional.
+    """``value`` as ``kind``: bool, int, float, str, tuples of them, mappings from str to them, any of them optional.
 
     Raises:
         InputError: it is something else; names ``source`` and ``field``.
@@ -94,6 +94,11 @@ def convert(value: Any, kind: Any, source: str, field: str) -> Any:
         if len(parts) != len(value):
             raise InputError(source, field, f"must be {len(parts)} values, not {len(value)}")
         return tuple(convert(v, p, source, field) for v, p in zip(value, parts, strict=True))
+    if origin is dict:
+        if not isinstance(value, Mapping):
+            raise InputError(source, field, f"must be a mapping, not {value!r}")
+        kept = typing.get_args(kind)[1]
+        return {str(key): convert(one, kept, source, f"{field}.{key}") for key, one in value.items()}
     if kind is Any:
         return value
     if kind is float and isinstance(value, (int, float)) and not isinstance(value, bool):

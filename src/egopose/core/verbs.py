@@ -34,4 +34,6 @@ BENCHMARKS = {
     "sync": 8,
     "stream": 1,
     "plan": 9,
+    "estimate": 3,
+    "film": 2,
 }

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import mujoco
 import numpy as np
-from scipy.optimize import nnls
+import scipy
 
 from egopose.humanoid.model import HumanoidModel
 from egopose.motion.motion import Motion, finite_difference
@@ -59,7 +59,7 @@ def contact_residual(humanoid: HumanoidModel, clip: Motion) -> Array:
         arms = np.repeat(points - data.qpos[:3], len(pyramid), axis=0)
         forces = np.tile(pyramid, (len(points), 1))
         supply = np.concatenate([forces, np.cross(arms, forces) / _LEVER], axis=1)
-        out[t] = nnls(supply.T, needed)[1]
+        out[t] = scipy.optimize.nnls(supply.T, needed)[1]
     if len(out) > 2:
         out[0], out[-1] = out[1], out[-2]
     return out

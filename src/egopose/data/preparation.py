@@ -204,7 +204,8 @@ def flow_name(config: Mapping[str, Any]) -> str:
     if config["data"]["split"]["kind"] == "table":
         rendered.append("rooms by table")
     corruption = Corruption.from_config(config)
-    known = [parts, rendered, *([asdict(corruption)] if corruption is not None else [])]
+    added = [part for part in (corruption and asdict(corruption), vision.get("film")) if part is not None]
+    known = [parts, rendered, *added]
     digest = hashlib.sha256(json.dumps(known, sort_keys=True, default=str).encode()).hexdigest()
     return f"{parts[0]}-{parts[2]}-{digest[:8]}"
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-from scipy.signal import butter, sosfiltfilt
+import scipy
 
 from egopose.data.reference import reference_states
 from egopose.humanoid.foot_geometry import lowest_points, sole_edges, sole_names, sole_positions
@@ -111,10 +111,10 @@ def low_pass(motion: Motion, cutoff_hz: float) -> Motion:
     """
     if len(motion) < 8 or cutoff_hz >= motion.fps / 2:
         return motion
-    sections = butter(2, cutoff_hz, fs=motion.fps, output="sos")
+    sections = scipy.signal.butter(2, cutoff_hz, fs=motion.fps, output="sos")
     qpos = motion.qpos.copy()
     qpos[:, 3:7] = rot.continuous(qpos[:, 3:7])
-    qpos = sosfiltfilt(sections, qpos, axis=0, padtype="odd", padlen=min(12, len(qpos) - 1))
+    qpos = scipy.signal.sosfiltfilt(sections, qpos, axis=0, padtype="odd", padlen=min(12, len(qpos) - 1))
     qpos[:, 3:7] = rot.normalize(qpos[:, 3:7])
     return replace(motion, qpos=qpos)
 

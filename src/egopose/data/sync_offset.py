@@ -121,13 +121,13 @@ def video_turning(
     for number, moved in enumerate(flow_of_frames(thinned(), flow)):
         if number:
             interval = times[number] - times[number - 1]
-            if camera.readout:
-                moved = undo_rolling_shutter(moved, camera.readout, interval)
+            if camera.delay:
+                moved = undo_rolling_shutter(moved, camera.delay, interval)
             turns.append(camera_rotation(moved[None], view)[0] / interval)
     if len(turns) < 2:
         raise InputError(path, "video", "has fewer than 3 frames")
     # The middle row is exposed half a readout after the frame's stamp.
-    edges = np.array(times) + 0.5 * camera.readout
+    edges = np.array(times) + 0.5 * camera.delay
     middles = 0.5 * (edges[:-1] + edges[1:])
     wanted = (np.arange(int(edges[-1] * rate)) + 0.5) / rate
     return np.stack([np.interp(wanted, middles, column) for column in np.array(turns).T], axis=1)

@@ -12,9 +12,8 @@ from dataclasses import dataclass, replace
 
 import mujoco
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.optimize import nnls
-from scipy.signal import butter, sosfiltfilt
 
 from egopose.core.errors import InputError
 from egopose.humanoid.model import HumanoidModel
@@ -105,8 +104,8 @@ def _smooth(motion: Motion, cutoff_hz: float | None) -> Array:
     qpos[:, 3:7] = rot.continuous(rot.normalize(qpos[:, 3:7]))
     if cutoff_hz is None or cutoff_hz >= motion.fps / 2:
         return qpos
-    sections = butter(2, cutoff_hz, fs=motion.fps, output="sos")
-    qpos = sosfiltfilt(sections, qpos, axis=0, padlen=min(12, len(qpos) - 1))
+    sections = scipy.signal.butter(2, cutoff_hz, fs=motion.fps, output="sos")
+    qpos = scipy.signal.sosfiltfilt(sections, qpos, axis=0, padlen=min(12, len(qpos) - 1))
     qpos[:, 3:7] = rot.normalize(qpos[:, 3:7])
     return np.asarray(qpos)
 
@@ -148,7 +147,7 @@ def _floor_forces(
     arms = np.repeat(points - data.qpos[:3], len(edges), axis=0)
     supply = np.concatenate([pushes, np.cross(arms, pushes) / settings.lever], axis=1).T
     even = settings.evenness * np.eye(len(pushes))
-    shares = nnls(np.concatenate([supply, even]), np.concatenate([needed, np.zeros(len(pushes))]))[0]
+    shares = scipy.optimize.nnls(np.concatenate([supply, even]), np.concatenate([needed, np.zeros(len(pushes))]))[0]
     forces = weight * (shares[:, None] * pushes).reshape(len(points), len(edges), 3).sum(axis=1)
     return forces, float(np.linalg.norm(supply @ shares - needed))
 

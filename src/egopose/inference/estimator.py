@@ -9,6 +9,7 @@ planner, the mean action is where planning begins, and V(s_t) is what the best p
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,9 +21,11 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from egopose.core.errors import InputError
 from egopose.envs.env import EgoPoseEnv
+from egopose.envs.mdp import rotations as torch_rotations
 from egopose.envs.test_time import Controller, prepare_for_test
 from egopose.humanoid.foot_geometry import out_of_floor
 from egopose.humanoid.model import HumanoidModel
+from egopose.inference.acting import Acting, acting
 from egopose.inference.counterfactuals import CounterfactualRollouts
 from egopose.inference.failsafe import FailSafe
 from egopose.inference.followed_path import FollowedPath
@@ -96,6 +99,7 @@ def estimate_takes(
     counterfactuals: CounterfactualRollouts | None = None,
     planner: Planner | None = None,
     restart: FollowedPath | None = None,
+    watch: Callable[[Array], None] | None = None,
 ) -> list[Estimate]:
     """Run every world's fragment from its first frame to its last.
 
@@ -113,6 +117,7 @@ def estimate_takes(
         planner: of as many bodies; None for the policy alone.
         restart: the path at whose place and heading bodies restart, with a row for every global frame; the planner's
             own, where there is a planner. None: they restart at their own.
+        watch: is shown the bodies ``[N, nq]`` of each frame as soon as they are known.
 
     Returns:
         One :class:`Estimate` a world; fragments may differ in length.
@@ -125,7 +130,9 @@ def estimate_takes(
     lengths = stop - start
     worlds = torch.arange(len(start))
     _restart(base, worlds, states[start], base.body_state()["qpos"])
-    observation = env.transform(base.observe())
+    # Counterfactuals take rows of TensorDicts.
+    body_acts = acting(env, actor, critic) if counterfactuals is None else Acting(env, actor, critic)
+    observation = body_acts.observed()
 
     rows: dict[str, list[Tensor]] = {
         name: [] for name in ("qpos", "value", "triggered", "resets", "fallen", "diverged")
@@ -136,21 +143,27 @@ def estimate_takes(
             body = base.body_state()
             if restart is not None and planner is None:  # a planner moves its path on by itself
                 restart.advance(base.frame, body["qpos"])
-            observation = critic(actor(observation))
+            observation = body_acts.act(observation)
             value = observation["state_value"].squeeze(-1)
             if planner is not None:
                 observation["action"] = observation["action"] + planner.perturbation(base)
                 value = planner.value
             triggered = guard.update(value, body["xpos"][:, base.problem.humanoid.head, 2], t < lengths)
+            if restart is not None:
+                now = restart.at((start + t).clamp(max=len(states) - 1))
+                facing = torch_rotations.yaw(body["qpos"][:, 3:7])
+                triggered |= (t < lengths) & guard.strayed(body["qpos"][:, :2], facing, *now)
             frame = (body["qpos"], value, triggered, placed, observation["fallen"].squeeze(-1), diverged)
             for name, column in zip(rows, frame, strict=True):
                 rows[name].append(column)
+            if watch is not None:
+                watch(body["qpos"].numpy())
             if counterfactuals is not None and triggered.any():
                 counterfactuals.keep(base, observation, triggered.nonzero().squeeze(-1))
             if t + 1 == int(lengths.max()):
                 break
-            after = env.step(observation)["next"]
-            diverged = after["diverged"].squeeze(-1)
+            observation = body_acts.step(observation)
+            diverged = observation["diverged"].squeeze(-1)
             placed = (triggered | diverged) & (t + 1 < lengths)
             again = placed.nonzero().squeeze(-1)
             if len(again):
@@ -160,8 +173,7 @@ def estimate_takes(
                 _restart(base, again, states[start[again] + t + 1], where)
                 if planner is not None:
                     planner.forget(again)
-                after = env.transform(base.observe())
-            observation = after.exclude("reward", "action")
+                observation = body_acts.observed()
     table = {name: torch.stack(column, dim=1).numpy() for name, column in rows.items()}
     confidence = torch.stack(guard.confidence, dim=1).numpy()
     return [

@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from egopose.core.errors import InputError
+from egopose.envs.mdp import rotations as rot
 
 MODES = ("value", "naive", "off")
 #: Yuan & Kitani 2019, sections 3.3 and 4: reset_threshold, and the discount their values have.
@@ -32,21 +33,29 @@ class FailSafeSettings:
         fallen_height: head height (m) under which the humanoid counts as fallen, for ``naive``.
         restart: ``own``: the humanoid restarts at its own place and heading (the paper); ``path``: at those of the path
             that is followed, see :mod:`egopose.inference.followed_path`.
+        stray_distance: m from the path, and stray_heading: degrees off it, beyond which a body is lost and restarts on
+            it; None for never.
 
     Raises:
-        InputError: an unknown mode or restart.
+        InputError: an unknown mode or restart; a limit that is not positive, or one without a path to restart on.
     """
 
     mode: str
     reset_threshold: float | None
     fallen_height: float
     restart: str = "own"
+    stray_distance: float | None = None
+    stray_heading: float | None = None
 
     def __post_init__(self) -> None:
         if self.mode not in MODES:
             raise InputError("failsafe", "mode", f"must be one of {', '.join(MODES)}, not {self.mode!r}")
         if self.restart not in ("own", "path"):
             raise InputError("failsafe", "restart", f"must be own or path, not {self.restart!r}")
+        for name in ("stray_distance", "stray_heading"):
+            limit = getattr(self, name)
+            if limit is not None and not (limit > 0 and self.restart == "path"):
+                raise InputError("failsafe", name, f"{limit}; must be positive, and needs restart=path, or null")
 
     def for_run(self, config: Mapping[str, Any], planned: float | None = None) -> FailSafeSettings:
         """With a threshold: its own, else ``planned`` (meant for a planner's values), else the paper's.
@@ -121,6 +130,16 @@ class FailSafe:
         ratio = torch.where(mean > 0, value / mean, torch.ones_like(value))
         self.confidence.append(torch.where(active, ratio, torch.full_like(ratio, float("nan"))))
         return active & self._unstable(ratio, head_height)
+
+    def strayed(self, place: Tensor, heading: Tensor, path_place: Tensor, path_heading: Tensor) -> Tensor:
+        """``[N]`` bool: bodies at ``place [N, 2]`` m, facing ``heading [N]`` rad, that lost the path they follow."""
+        distance, turn = self.settings.stray_distance, self.settings.stray_heading
+        lost = torch.zeros(len(place), dtype=torch.bool)
+        if distance is not None:
+            lost |= (place - path_place).norm(dim=-1) > distance
+        if turn is not None:
+            lost |= rot.wrapped(heading - path_heading).abs() > math.radians(turn)
+        return lost
 
     def _unstable(self, ratio: Tensor, head_height: Tensor) -> Tensor:
         if self.settings.mode == "value":

@@ -45,10 +45,10 @@ def causal_regression(
     """
     smoothing = float(task["action"].get("smoothing", 0.0)) / humanoid.control_dt
     joint_range = torch.as_tensor(humanoid.joint_range)
-    return CausalRegression(regressor, joint_range, lookahead, _crossed(source_config), smoothing)
+    return CausalRegression(regressor, joint_range, lookahead, crossed(source_config), smoothing)
 
 
-def _crossed(source_config: Mapping[str, Any]) -> bool:
+def crossed(source_config: Mapping[str, Any]) -> bool:
     """A policy trained on the tables of several fits reads the regressor's states for a context."""
     return int(source_config["regressor"]["cross_fit"]) > 1
 
@@ -73,7 +73,7 @@ def seen_in(
     states = seen["humanoid_state"]
     return {
         "visual_features": seen["visual_features"],
-        "visual_context": regressor.normalise(states) if _crossed(source_config) else seen["visual_context"],
+        "visual_context": regressor.normalise(states) if crossed(source_config) else seen["visual_context"],
         "humanoid_state": states,
         "joint_targets": joint_targets(states, humanoid),
     }
@@ -135,7 +135,7 @@ def video_dataset(
         TakeTable(torch.tensor([0]), torch.tensor([frames]), lowest),
         train=whole,
         test=whole,
-        visual_features=seen["visual_features"],
+        visual_features=seen.get("visual_features"),
         visual_context=seen["visual_context"],
         joint_targets=seen["joint_targets"],
         states=seen["humanoid_state"],

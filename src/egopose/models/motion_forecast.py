@@ -13,9 +13,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+import scipy
 import torch
 from numpy.typing import NDArray
-from scipy.interpolate import BSpline
 from torch import Tensor, nn
 
 from egopose.models.baselines.recurrent import RecurrentForecaster
@@ -36,7 +36,7 @@ def spline_basis(frames: int, spacing: int, fps: float) -> tuple[Tensor, Tensor]
     knots = _knots(frames, spacing)
     count = len(knots) - 4
     at = np.arange(frames, dtype=np.float64)
-    spline = BSpline(knots, np.eye(count), 3)
+    spline = scipy.interpolate.BSpline(knots, np.eye(count), 3)
     return torch.from_numpy(spline(at)).float(), torch.from_numpy(spline.derivative()(at) * fps).float()
 
 

@@ -24,12 +24,14 @@ from egopose.motion.rotations import Array
 from egopose.training.body_parts import (
     BodyPartSettings,
     Pictures,
+    bodiless_figures,
     held_out_figures,
     save_body_part_estimator,
     train_body_part_estimator,
 )
+from egopose.vision.bodiless_pictures import KINDS, bodiless_pictures
 from egopose.vision.body_part_pictures import PictureSettings, Scenes, draw_pictures, read_pictures
-from egopose.vision.flow import FlowConfig
+from egopose.vision.flow import FlowConfig, FlowEstimator
 from egopose.vision.takes import RenderConfig
 
 
@@ -92,6 +94,9 @@ def make_body_part_estimator(values: Mapping[str, Any]) -> dict[str, Any]:
     pictures = PictureSettings.from_config(values["pictures"])
     training = BodyPartSettings.from_config(values["training"])
     motions = convert(values["motions"], tuple[str, ...], "conf/body_parts.yaml", "motions")
+    bodiless = convert(values["bodiless"], int, "conf/body_parts.yaml", "bodiless")
+    if bodiless < 1:
+        raise InputError("conf/body_parts.yaml", "bodiless", f"must be at least 1, not {bodiless}")
     files = motion_files(motions, convert(values["exclude"], tuple[str, ...], "conf/body_parts.yaml", "exclude"))
     humanoid = humanoid_of(values)
     made_from = {"motions": {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in files}}
@@ -135,6 +140,12 @@ def make_body_part_estimator(values: Mapping[str, Any]) -> dict[str, Any]:
     )
     held_out = data.rows(slice(first_held_out, len(data)))
     card["figures"] = held_out_figures(model, held_out, humanoid.skeleton, training.batch)
+    flow = FlowEstimator(scenes.flow)
+    card["without a body"] = {}
+    for kind in KINDS:
+        without, moved = bodiless_pictures(kind, seed, bodiless, scenes.render, flow)
+        seen = torch.from_numpy(without), torch.from_numpy(moved)
+        card["without a body"][kind] = bodiless_figures(model, *seen, training.batch)
     save_body_part_estimator(
         out / "finder", model, humanoid.skeleton, scenes.flow, card, steps=round(training.epochs * len(data))
     )
@@ -152,4 +163,6 @@ def train_body_parts(values: Mapping[str, Any]) -> None:
     print(f"{card['held_out']} held-out pictures; share of the variance that is explained:")
     for group, figures in card["figures"].items():
         print(f"{group}: " + ", ".join(f"{name} {value:.2f}" for name, value in figures.items()))
+    for kind, figures in card.get("without a body", {}).items():
+        print(f"{kind} without a body: {figures['false']:.3f} of the cells taken for one")
     print(f"finder: {Path(str(values['out'])) / 'finder'}")

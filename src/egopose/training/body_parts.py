@@ -303,6 +303,31 @@ def train_body_part_estimator(
 
 
 @torch.no_grad()
+def bodiless_figures(model: BodyPartEstimator, pictures: Tensor, flow: Tensor, batch: int) -> dict[str, float]:
+    """What a finder sees where there is no body (:mod:`egopose.vision.bodiless_pictures`).
+
+    Args:
+        model: the finder.
+        pictures: ``[N, 6, 64, 64]`` uint8. flow: ``[N, 2, 32, 32]``.
+        batch: pictures a forward pass.
+
+    Returns:
+        ``false``: share of the cells that some mask covers by more than half, and the same by limb; ``variance``: the
+        mean of the variances that it states for places of bodies, "up" and the camera's height, in squares of their
+        deviations in training. An estimator that knows that it sees nothing states 1 or more.
+    """
+    model.eval()
+    masks, variances = [], []
+    for rows in torch.arange(len(pictures)).split(batch):
+        mask, _, log_variance = model(pictures[rows, :3], pictures[rows, 3:], flow[rows])
+        masks.append(torch.sigmoid(mask) > 0.5)
+        variances.append(log_variance[:, : 3 * len(BODIES) + 4].exp())
+    covered = torch.cat(masks)
+    by_limb = {limb: float(covered[:, at].float().mean()) for at, limb in enumerate(LIMBS)}
+    return {"false": float(covered.any(1).float().mean()), **by_limb, "variance": float(torch.cat(variances).mean())}
+
+
+@torch.no_grad()
 def held_out_figures(
     model: BodyPartEstimator, data: Pictures, skeleton: Skeleton, batch: int
 ) -> dict[str, dict[str, float]]:

@@ -33,11 +33,14 @@ from egopose.core.safe_io import read_json
 from egopose.motion.io._npz import read_arrays
 from egopose.motion.rotations import Array, from_axis_angle, from_scipy, multiply, rotate
 from egopose.motion.skeleton import Skeleton
-from egopose.vision.body_parts import FLOW, LIMBS, PICTURE
+from egopose.vision.body_parts import FLOW, LIMBS
+from egopose.vision.film import PICTURE
 from egopose.vision.flow import FlowConfig, FlowEstimator, grey_square
 from egopose.vision.gl import choose_backend
-from egopose.vision.rendering import WEARER_CAMERA, SceneRenderer, WearerCamera, camera_orientations, furnished_model
-from egopose.vision.rooms import Range, draw_room
+from egopose.vision.mounts import WEARER_CAMERA, camera_orientations
+from egopose.vision.rendering import SceneRenderer, WearerCamera, furnished_model
+from egopose.vision.rooms import draw_room
+from egopose.vision.surfaces import Range
 from egopose.vision.takes import RenderConfig
 
 #: Bodies whose positions in the camera's frame (x right, y up, z back; m) make the first part of a posture.

@@ -15,22 +15,21 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional
 
-from egopose.vision.flow import centred_square
-from egopose.vision.video import Frame
+from egopose.vision.film import PICTURE
 
-#: Side in pixels of the pictures it looks at, and of the flow (conf/vision/light.yaml's stored size).
-PICTURE, FLOW = 64, 32
+#: Side of the flow (conf/vision/light.yaml's stored size).
+FLOW = 32
 #: Classes of the masks.
 LIMBS = ("right arm", "left arm", "right leg", "left leg", "trunk")
 #: Least and largest logarithm of a variance that an estimator gives.
 LOG_VARIANCE = (-4.0, 3.0)
 _FLOW_SCALE = 20.0  # as conf/vision/light.yaml: flow in widths a frame, times this, is of order one
 _SUMMARY = 256
-_BATCH = 256  # frames a forward pass
+_BATCH = 64  # frames a forward pass: their features stay in a core's cache; 256 take 1.7 times as long
 Picture = NDArray[np.uint8]
 
 
-"""``[64, 64, 3]`` RGB, see :func:`small_picture`."""
+"""``[64, 64, 3]`` RGB, see :func:`egopose.vision.film.small_picture`."""
 
 
 class _Residual(nn.Module):
@@ -113,12 +112,6 @@ class BodyPartEstimator(nn.Module):
         return torch.cat([(posture - self.mean) / self.std, log_variance[..., self.mirror_index] + scale], -1)
 
 
-def small_picture(frame: Frame) -> Picture:
-    """The centred square of an RGB frame ``[H, W, 3]``, area-averaged to what a finder looks at."""
-    # A copy also of a frame of that size: pictures are kept, and a reader's buffer may not be.
-    return centred_square(frame, PICTURE).copy()
-
-
 @torch.no_grad()
 def body_part_rows(
     finder: BodyPartEstimator, pictures: Sequence[Picture] | NDArray[np.uint8], flow: NDArray
@@ -127,7 +120,7 @@ def body_part_rows(
 
     Args:
         finder: in evaluation mode.
-        pictures: T of :func:`small_picture`; nothing precedes the first.
+        pictures: T of :func:`egopose.vision.film.small_picture`; nothing precedes the first.
         flow: ``[T, 2, S, S]`` of the same frames, each from the one before.
     """
     rows = []

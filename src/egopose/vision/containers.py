@@ -96,14 +96,14 @@ def look_into(path: str | PathLike[str]) -> Container:
 def _mp4(path: str | PathLike[str], stream: BinaryIO, size: int) -> Container:
     """Walks from the file's boxes to the description of each track."""
     cut, tracks, found = "", [], False
-    for kind, start, end in _boxes(stream, 0, size):
+    for kind, start, end in boxes(stream, 0, size):
         if end > size:
             cut = f"cut short: the box {_code(kind)} should reach to byte {end}, the file has {size}"
         if kind == b"moov":
             found = True
             tracks = [
                 (_handler(stream, body, stop), _sample_kind(stream, body, stop))
-                for box, body, stop in _boxes(stream, start, min(end, size))
+                for box, body, stop in boxes(stream, start, min(end, size))
                 if box == b"trak"
             ]
     if not found:
@@ -117,7 +117,7 @@ def _mp4(path: str | PathLike[str], stream: BinaryIO, size: int) -> Container:
     return Container("MP4", _code(videos[0]), cut)
 
 
-def _boxes(stream: BinaryIO, start: int, end: int) -> Iterator[tuple[bytes, int, int]]:
+def boxes(stream: BinaryIO, start: int, end: int) -> Iterator[tuple[bytes, int, int]]:
     """Kind, first byte of the content and last of the boxes in a part of the file; a box may reach beyond it."""
     for _ in range(_MAX_BOXES):
         if start + 8 > end:
@@ -134,10 +134,10 @@ def _boxes(stream: BinaryIO, start: int, end: int) -> Iterator[tuple[bytes, int,
         start = stop
 
 
-def _inside(stream: BinaryIO, start: int, end: int, *names: bytes) -> tuple[int, int] | None:
+def inside_box(stream: BinaryIO, start: int, end: int, *names: bytes) -> tuple[int, int] | None:
     """Content of the box that a path of names leads to."""
     for name in names:
-        found = next(((s, e) for kind, s, e in _boxes(stream, start, end) if kind == name), None)
+        found = next(((s, e) for kind, s, e in boxes(stream, start, end) if kind == name), None)
         if found is None:
             return None
         start, end = found[0], min(found[1], end)
@@ -146,12 +146,12 @@ def _inside(stream: BinaryIO, start: int, end: int, *names: bytes) -> tuple[int,
 
 def _handler(stream: BinaryIO, start: int, end: int) -> bytes:
     """What a track is: ``vide``, ``soun`` ..."""
-    return _read(stream, _inside(stream, start, end, b"mdia", b"hdlr"), 8)
+    return _read(stream, inside_box(stream, start, end, b"mdia", b"hdlr"), 8)
 
 
 def _sample_kind(stream: BinaryIO, start: int, end: int) -> bytes:
     """The code of a track's codec."""
-    return _read(stream, _inside(stream, start, end, b"mdia", b"minf", b"stbl", b"stsd"), 12)
+    return _read(stream, inside_box(stream, start, end, b"mdia", b"minf", b"stbl", b"stsd"), 12)
 
 
 def _read(stream: BinaryIO, part: tuple[int, int] | None, offset: int) -> bytes:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping, Sequence
 from os import PathLike
 from typing import Any
 
@@ -11,11 +11,11 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from egopose.vision.body_parts import BodyPartEstimator, Picture, as_plane, body_part_rows, small_picture
+from egopose.vision.body_parts import BodyPartEstimator, Picture, as_plane, body_part_rows
 from egopose.vision.encoders import FlowEncoder
-from egopose.vision.flow import FlowConfig, flow_of_frames
-from egopose.vision.lens import Camera, undo_rolling_shutter
-from egopose.vision.video import Frame, iter_frames, probe_video
+from egopose.vision.film import film_rows, frames_at, small_picture
+from egopose.vision.flow import FlowConfig
+from egopose.vision.lens import Camera
 
 
 def extract_flow(
@@ -46,16 +46,16 @@ def extract_flow(
         InputError: the video cannot be read or does not cover the motion.
     """
     config = cfg if isinstance(cfg, FlowConfig) else FlowConfig(**dict(cfg))
-    frames = _frames(path, config, fps, offset, count, camera)
-    pictures: list[Picture] = []
-    if finder is not None:
-        frames = _remembered(frames, pictures)
-    flow = np.stack(list(flow_of_frames(frames, config)))
-    if camera is not None and camera.readout:
-        flow = undo_rolling_shutter(flow, camera.readout, 1.0 / fps)
-    if finder is None:
-        return flow
-    return np.concatenate([flow, as_plane(body_part_rows(finder, pictures, flow), config.stored_size)], axis=1)
+    rows = list(film_rows(path, config, fps, offset, count, camera, pictures=finder is not None))
+    flow = np.stack([row[0] for row in rows])
+    return flow if finder is None else with_body_parts(finder, [row[1] for row in rows if row[1] is not None], flow)
+
+
+def with_body_parts(
+    finder: BodyPartEstimator, pictures: Sequence[Picture], flow: NDArray[np.float16]
+) -> NDArray[np.float16]:
+    """Flow ``[T, 2, S, S]`` with what a finder makes of the clip as a third plane, ``[T, 3, S, S]``."""
+    return np.concatenate([flow, as_plane(body_part_rows(finder, pictures, flow), flow.shape[-1])], axis=1)
 
 
 def extract_body_parts(
@@ -73,26 +73,8 @@ def extract_body_parts(
 
     Other arguments, and errors, as of :func:`extract_flow`.
     """
-    pictures = [small_picture(frame) for frame in _frames(path, cfg, fps, offset, len(flow), camera)]
+    pictures = [small_picture(frame) for frame in frames_at(path, cfg.working_size, fps, offset, len(flow), camera)]
     return body_part_rows(finder, pictures, flow)
-
-
-def _frames(
-    path: str | PathLike[str], config: FlowConfig, fps: float, offset: float, count: int | None, camera: Camera | None
-) -> Iterator[Frame]:
-    """Frames at the motion's times, without what the lens does to them."""
-    if camera is None:
-        return iter_frames(path, fps, offset, count)
-    info = probe_video(path)
-    rectify = camera.rectifier(info.width, info.height, config.working_size)
-    # The middle row, which stands for the frame, is exposed half a readout after its stamp.
-    return map(rectify, iter_frames(path, fps, offset - 0.5 * camera.readout, count, camera.fps))
-
-
-def _remembered(frames: Iterator[Frame], pictures: list[Picture]) -> Iterator[Frame]:
-    for frame in frames:
-        pictures.append(small_picture(frame))
-        yield frame
 
 
 @torch.no_grad()

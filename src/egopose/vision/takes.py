@@ -18,9 +18,11 @@ from egopose.core.runtime import end_with_parent
 from egopose.core.safe_io import read_json
 from egopose.motion.rotations import Array
 from egopose.vision.corruption import Corruption
+from egopose.vision.film_takes import FilmRanges, draw_take, film_frames
 from egopose.vision.gl import choose_backend
 from egopose.vision.rendering import CameraConfig, render_wearer_video
 from egopose.vision.rooms import RoomConfig, room_seed
+from egopose.vision.video import write_video
 
 
 @dataclass(frozen=True)
@@ -32,6 +34,7 @@ class RenderConfig:
     room: RoomConfig
     camera: CameraConfig
     corruption: Corruption | None = None
+    film: FilmRanges | None = None
 
     @classmethod
     def from_mapping(cls, cfg: Mapping[str, Any], corruption: Corruption | None = None) -> RenderConfig:
@@ -43,7 +46,10 @@ class RenderConfig:
         try:
             room, camera = ({k: _plain(v) for k, v in cfg[group].items()} for group in ("room", "camera"))
             size, fps = int(cfg["video"]["size"]), float(cfg["video"]["fps"])
-            return cls(size, fps, RoomConfig(**room), CameraConfig(**camera), corruption)
+            film = None if cfg.get("film") is None else FilmRanges.from_mapping(cfg["film"])
+            return cls(size, fps, RoomConfig(**room), CameraConfig(**camera), corruption, film)
+        except InputError:
+            raise
         except (KeyError, TypeError, ValueError) as error:
             raise InputError("conf/vision", "video, room, camera", f"{error}") from error
 
@@ -78,8 +84,9 @@ class RenderJob:
 def job_fingerprint(job: RenderJob, config: RenderConfig) -> str:
     """Changes with whatever changes the video."""
     digest = hashlib.sha256()
-    # Videos from before there were corruptions stay valid.
-    known = {key: value for key, value in asdict(config).items() if key != "corruption" or value is not None}
+    # Videos from before there were corruptions and films stay valid.
+    added = ("corruption", "film")
+    known = {key: value for key, value in asdict(config).items() if key not in added or value is not None}
     settings = json.dumps([job.name, job.split, known], sort_keys=True)
     for part in (settings.encode(), job.model_xml.encode(), job.qpos.tobytes()):
         digest.update(hashlib.sha256(part).digest())
@@ -112,19 +119,27 @@ def render_take(job: RenderJob, config: RenderConfig) -> int:
     if _record(job.path).exists():
         # Until the new video is there the old record must not vouch for the old one.
         _record(job.path).unlink()
-    render_wearer_video(
-        job.model_xml,
-        job.qpos,
-        job.path,
-        room_seed=seed,
-        take_seed=take_seed(job.name),
-        room=config.room,
-        camera=config.camera,
-        size=config.size,
-        fps=config.fps,
-        corruption=config.corruption,
-    )
     record = {"fingerprint": job_fingerprint(job, config), "take": job.name, "split": job.split, "room": seed}
+    if config.film is not None:
+        take = draw_take(take_seed(job.name), config.film, config.camera)
+        frames = film_frames(
+            job.model_xml, job.qpos, take, seed, config.room, config.size, config.fps, config.corruption
+        )
+        write_video(job.path, frames, config.fps)
+        record |= {"camera": take.camera_record(), "place": take.place_record()}
+    else:
+        render_wearer_video(
+            job.model_xml,
+            job.qpos,
+            job.path,
+            room_seed=seed,
+            take_seed=take_seed(job.name),
+            room=config.room,
+            camera=config.camera,
+            size=config.size,
+            fps=config.fps,
+            corruption=config.corruption,
+        )
     _record(job.path).write_text(json.dumps({**record, "frames": len(job.qpos), "rendered": True}, indent=1))
     return len(job.qpos)
 

@@ -254,7 +254,20 @@ def iter_frames(
     count: int | None = None,
     taken_at: float | None = None,
 ) -> Iterator[Frame]:
-    """The video's frames at the motion's times: frame k is the one nearest to video time ``k / fps + offset``.
+    """The video's frames at the motion's times, see :func:`timed_frames`, whose errors it raises."""
+    return (frame for _, frame in timed_frames(path, fps, offset, count, taken_at))
+
+
+def timed_frames(
+    path: str | PathLike[str],
+    fps: float = 30.0,
+    offset: float = 0.0,
+    count: int | None = None,
+    taken_at: float | None = None,
+) -> Iterator[tuple[float, Frame]]:
+    """The video's frames at the motion's times, each with the time (s) of its own stamp.
+
+    Frame k is the one nearest to video time ``k / fps + offset``.
 
     Args:
         path: the video.
@@ -280,15 +293,15 @@ def iter_frames(
             interval = time - previous[0]
             middle = 0.5 * (previous[0] + time)
             while emitted / fps + offset <= middle and (count is None or emitted < count):
-                yield previous[1]
+                yield previous
                 emitted += 1
         if count is not None and emitted >= count:
             return
         previous = (time, frame)
     assert previous is not None
-    end, frame = previous
+    end = previous[0]
     while emitted / fps + offset <= end + 0.5 * interval and (count is None or emitted < count):
-        yield frame
+        yield previous
         emitted += 1
     if emitted == 0:
         raise InputError(path, "sync_offset", f"{offset:.3f} s lies behind the video's end at {end:.3f} s")
@@ -300,4 +313,4 @@ def iter_frames(
             f"the video ends {missing / fps:.3f} s before the motion: cut the motion's end or the offset",
         )
     for _ in range(missing):
-        yield frame
+        yield previous

@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from egopose.models.regressor import StateRegressor
-from egopose.vision.body_parts import PICTURE, BodyPartEstimator, Picture, as_plane, pair_rows, small_picture
+from egopose.vision.body_parts import BodyPartEstimator, Picture, as_plane, pair_rows
+from egopose.vision.film import PICTURE, small_picture
 from egopose.vision.flow import FlowConfig, FlowEstimator, grey_square
 from egopose.vision.lens import Camera, undo_rolling_shutter
 from egopose.vision.video import Frame
@@ -75,8 +76,8 @@ class FrameFeatures:
     ) -> NDArray[np.float32]:
         flow = self._estimator(before[1], now)
         interval = time - before[0]
-        if self._camera.readout:
-            flow = undo_rolling_shutter(flow, self._camera.readout, interval)
+        if self._camera.delay:
+            flow = undo_rolling_shutter(flow, self._camera.delay, interval)
         passed = interval * self._rate
         whole = max(round(passed), 1)
         return flow.astype(np.float32) / np.float32(whole if abs(passed - whole) < _ROUNDING else passed)

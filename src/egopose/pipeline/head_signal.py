@@ -1,0 +1,88 @@
+"""From motion capture of many people to a regressor of head signals, trained, judged and saved."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from egopose.checkpoint.head_signal import save_head_signal_regressor
+from egopose.core.config import compose_config, convert, from_mapping
+from egopose.core.errors import InputError
+from egopose.data.preparation import humanoid_of, prepare
+from egopose.data.splits import split_takes
+from egopose.motion.rotations import Array
+from egopose.training.head_signal_figures import held_out_figures
+from egopose.training.head_signal_regressor import HeadSignalSettings, train_head_signal_regressor
+
+_SOURCE = "conf/head_signal.yaml"
+_WHOLE = {"kind": "time", "train_share": 1.0, "shortest": 1}
+
+
+def motions_of(values: Mapping[str, Any]) -> tuple[list[Array], list[Array]]:
+    """Motions ``qpos [T, nq]`` to learn from and to be judged on, of the sources in ``conf/head_signal.yaml``.
+
+    Each source is a choice of ``conf/data``. Those in ``whole`` train with all their takes, others as they are split.
+
+    Raises:
+        InputError: a source cannot be used, none is given, or ``whole`` names none of them.
+    """
+    sources = {name: folder for name, folder in values["sources"].items() if folder is not None}
+    whole = convert(values["whole"], tuple[str, ...], _SOURCE, "whole")
+    if not sources:
+        raise InputError(_SOURCE, "sources", "none is given: sources.cmu_people=FOLDER")
+    if unknown := set(whole) - set(values["sources"]):
+        raise InputError(_SOURCE, "whole", f"{sorted(unknown)[0]!r} is no source; there are {', '.join(sources)}")
+    train: list[Array] = []
+    test: list[Array] = []
+    for name, folder in sources.items():
+        config = compose_config("train", [f"data={name}"])
+        config["data"]["folder"] = convert(folder, str, _SOURCE, f"sources.{name}")
+        store = prepare({**config, "humanoid": values["humanoid"], "sim": values["sim"]}, flow=False)
+        split = _WHOLE if name in whole else config["data"]["split"]
+        for part, motions in (("train", train), ("test", test)):
+            if part == "test" and name in whole:
+                continue
+            # A split leaves out what a body on a bare floor cannot do; a head's signal is true of it all the same.
+            pieces = split_takes(store.takes, split, part, supported_only=False)
+            motions += [store.clip(piece.take).qpos[piece.start : piece.stop] for piece in pieces]
+    return train, test
+
+
+def make_head_signal_regressor(values: Mapping[str, Any]) -> dict[str, dict[str, float]]:
+    """Run ``conf/head_signal.yaml``, resolved; returns the figures by mount, empty where nothing is held out.
+
+    Raises:
+        InputError: a source or a setting cannot be used, or ``out`` is there.
+    """
+    out = Path(str(values["out"])).expanduser()
+    if out.exists():
+        raise InputError(out, "out", "is there already: remove it or name another folder")
+    settings = from_mapping(HeadSignalSettings, values["training"], f"{_SOURCE}: training")
+    humanoid = humanoid_of(values)
+    train, test = motions_of(values)
+    print(f"{len(train)} clips to learn from, {sum(map(len, train))} frames", file=sys.stderr, flush=True)
+
+    def tell(epoch: int, error: float, seconds: float) -> None:
+        print(f"epoch {epoch} of {settings.epochs}, error {error:.4f}, {seconds:.1f} s", file=sys.stderr, flush=True)
+
+    model = train_head_signal_regressor(humanoid, train, settings, tell)
+    save_head_signal_regressor(model, humanoid, settings, out)
+    if not test:
+        return {}
+    pitch = 0.5 * sum(settings.pitch_down)
+    return held_out_figures(model, humanoid, test, tuple(settings.mounts), pitch)
+
+
+def train_head_signal(values: Mapping[str, Any]) -> None:
+    """:func:`make_head_signal_regressor`, and what it found on the terminal.
+
+    Raises:
+        InputError: see there.
+    """
+    figures = make_head_signal_regressor(values)
+    print("held-out people, exact signals:" if figures else "no source holds people out: nothing is judged")
+    for mount, row in figures.items():
+        print(f"{mount}: " + ", ".join(f"{name} {value:.3f}" for name, value in row.items()))
+    print(f"regressor: {Path(str(values['out']))}")
