@@ -22,9 +22,10 @@ bad films from good ones?
 
 ```bash
 for place in open_ground street furnished_room
-do egopose bench film --json part=cameras place=$place > experiments/film/raw/cameras_$place.json
+do egopose bench film --rounds 1 --json part=cameras place=$place stabilised=no > experiments/film/raw/cameras_$place.json
 done
-egopose bench film --json part=clips,confidence > experiments/film/raw/clips.json
+egopose bench film --rounds 1 --json part=cameras stabilised=yes pitch=20 > experiments/film/raw/cameras_stabilised.json
+egopose bench film --rounds 1 --json part=clips,confidence > experiments/film/raw/clips.json
 python experiments/film/film.py
 ```
 

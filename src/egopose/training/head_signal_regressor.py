@@ -20,6 +20,7 @@ from egopose.core.errors import InputError
 from egopose.core.torch_settings import torch_threads
 from egopose.envs.mdp.observations import humanoid_state_rows
 from egopose.humanoid.model import HumanoidModel
+from egopose.humanoid.state_layout import StateLayout
 from egopose.models.head_signal_input import SIGNAL_FEATURES, mirrored_features, signal_features
 from egopose.models.mirror import state_mirror
 from egopose.models.regressor import StateRegressor, state_statistics
@@ -173,8 +174,7 @@ def still_example(example: Example, frame: int, length: int, generator: torch.Ge
     """A body that stands in the pose of one frame, breathing: its signal is what is left of a standing head's."""
     features = example.features[frame].repeat(length, 1)
     states = example.states[frame].repeat(length, 1)
-    width = (states.shape[1] - 11) // 2
-    states[:, 5 + width :] = 0.0
+    states[:, StateLayout.of_size(states.shape[1]).velocities] = 0.0
     sway = torch.randn(length, 6, generator=generator) * torch.tensor([0.01, 0.01, 0.01, 0.01, 0.01, 0.005])
     features[:, :6] = slow(sway, 0.5)
     return Example(features, states)
