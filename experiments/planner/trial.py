@@ -46,7 +46,7 @@ def drawn(fragments: Sequence[FragmentLike], frames: int, seed: int) -> list[Fra
 
 
 def row(agent: Agent, fragments: Sequence[FragmentLike], changes: dict[str, Any] | None) -> list[FragmentResult]:
-    settings = compose_config("evaluate", ["checkpoint=none", "reward@planner.reward=estimation"])
+    settings = compose_config("evaluate", ["checkpoint=none"])
     planner = planner_settings(settings["planner"])
     assert planner is not None
     contact = from_mapping(ContactSettings, settings["contact"], "conf/evaluate.yaml: contact")

@@ -16,14 +16,15 @@ from egopose.vision.head_signal import HeadSignal, signal_of_motion
 from egopose.vision.mounts import camera_poses, mount_of
 
 FPS, COUNT = 30.0, 240
-ALL = {"turning", "speed", "bob", "seen", "rigid"}
+ALL = {"turning", "speed", "bob", "worn", "seen", "rigid", "measured"}
 
 
 def walker() -> HeadSignal:
-    """One who walks at 0.8 heights/s, turns to and fro and bobs twice a second."""
+    """One who walks at 0.8 heights/s, turns to and fro, and bobs and rolls with two steps a second."""
     times = np.arange(COUNT) / FPS
     turning, velocity = np.zeros((COUNT, 3)), np.zeros((COUNT, 3))
     turning[:, 2] = 0.8 * np.sin(2 * np.pi * 0.2 * times)
+    turning[:, 0] = 0.2 * np.sin(2 * np.pi * 2.0 * times)
     velocity[:, 0], velocity[:, 2] = 0.8, 0.15 * np.sin(2 * np.pi * 2.0 * times)
     return HeadSignal(turning, velocity, np.zeros((COUNT, 2)), np.ones((COUNT, 3)))
 
@@ -47,9 +48,11 @@ def changed(name: str) -> tuple[HeadSignal, HeadSignal]:
         body = replace(body, velocity=body.velocity * [-0.5, 1.0, 1.0])
     elif name == "bob":
         film = replace(film, velocity=film.velocity * [1.0, 1.0, 0.0])
+    elif name == "worn":
+        film = replace(film, turning=film.turning * [0.02, 1.0, 1.0])
     else:
         quality = np.ones((COUNT, 3))
-        quality[:, {"seen": 1, "rigid": 2}[name]] = 0.05
+        quality[:, {"measured": 0, "seen": 1, "rigid": 2}[name]] = 0.05
         film = replace(film, quality=quality)
     return body, film
 
@@ -60,6 +63,8 @@ def changed(name: str) -> tuple[HeadSignal, HeadSignal]:
         ("turning", "turns otherwise"),
         ("speed", "moves otherwise"),
         ("bob", "does not bob"),
+        ("worn", "too steady to be worn"),
+        ("measured", "as the gyroscope does"),
         ("seen", "no ground is seen"),
         ("rigid", "things that stand still"),
     ],

@@ -577,7 +577,7 @@ def test_an_evaluation_has_the_same_threads_whatever_the_process_did_before(befo
 
 def test_estimates_plan_unless_they_are_causal_or_told_not_to() -> None:
     chosen = compose_config("estimate", ["video=none", "checkpoint=none"])
-    assert allowed_planner(chosen) == settings()
+    assert allowed_planner(chosen) == settings(reward=group("reward", "estimation_path"))
     assert allowed_planner({**chosen, "causal": True}) is None
     assert allowed_planner({**chosen, "planner": None}) is None
     with pytest.raises(InputError, match="samples"):  # a wrong setting is told even where it is not used

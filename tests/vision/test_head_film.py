@@ -174,7 +174,7 @@ def test_a_sensors_table_beside_the_film_tells_the_vertical(film: Path, tmp_path
     table = sensors(tmp_path / "imu.csv", PITCH)
     signal = read_head_signal(film, 30.0, CAMERA, WornCamera(telemetry=str(table)))
     np.testing.assert_allclose(np.rad2deg(signal.tilt), [[PITCH, 0.0]] * 30, atol=0.1)
-    np.testing.assert_array_equal(signal.quality[1:, 0], 1.0)
+    assert signal.quality[1:, 0].min() > 0.9  # the picture turns as the table says
     assert signal.velocity[2:, 0].mean() == pytest.approx(SPEED / 1.6, abs=0.05)
     # The table is believed even where it is wrong: nothing else was asked for.
     wrong = read_head_signal(film, 30.0, CAMERA, WornCamera(telemetry=str(sensors(tmp_path / "other.csv", 30.0))))

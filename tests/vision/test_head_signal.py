@@ -60,6 +60,7 @@ def test_the_mirror_image(seed: int) -> None:
     np.testing.assert_allclose(other.tilt, own.tilt * [1, -1], atol=1e-9)
 
 
+@settings(deadline=None)
 @given(st.floats(-1.5, 1.5), st.floats(-3.1, 3.1))
 def test_tilt_and_down_are_each_others_inverse(pitch: float, roll: float) -> None:
     down = down_of(pitch, roll)
@@ -149,7 +150,7 @@ def test_flow_of_a_path_has_the_paths_signal(seed: int) -> None:
     measured = signal_of_flow(flow, VIEW, intervals, down, turning)
     assert apart(measured, true, "turning") < 0.01
     assert apart(measured, true, "velocity") < 0.05
-    np.testing.assert_array_equal(measured.quality[1:, 0], 1.0)
+    assert measured.quality[1:, 0].min() > 0.99
 
 
 def test_flow_without_an_instrument_still_tells_the_walk() -> None:
@@ -159,6 +160,17 @@ def test_flow_without_an_instrument_still_tells_the_walk() -> None:
     assert found.velocity[1:, 0].mean() == pytest.approx(true.velocity[1:, 0].mean(), rel=0.05)
     assert found.turning[1:, 2].mean() == pytest.approx(0.3, abs=0.03)
     assert found.quality[1:].min() > 0.5
+
+
+@pytest.mark.parametrize("said", [0.6 * VIEW, 1.5 * VIEW])
+def test_another_lens_is_told_by_the_gyroscope(said: float) -> None:
+    """The picture of a lens that is said wrong turns too fast or too slowly."""
+    positions, rotations = any_path(3, 90, FPS, np.deg2rad(30.0))
+    turning = np.zeros((90, 3))
+    turning[1:] = Rotation.from_matrix(np.swapaxes(rotations[:-1], 1, 2) @ rotations[1:]).as_rotvec() * FPS
+    flow, intervals, down = filmed(positions, rotations), np.full(90, 1 / FPS), -rotations[:, 2]
+    right, wrong = (signal_of_flow(flow, view, intervals, down, turning).quality[1:, 0] for view in (VIEW, said))
+    assert wrong.mean() < 0.8 < 0.95 < right.mean()
 
 
 def test_a_steadied_picture_leaves_the_turns_to_the_gyroscope() -> None:

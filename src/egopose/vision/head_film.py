@@ -36,7 +36,7 @@ from egopose.vision.telemetry import (
 from egopose.vision.video import Frame, probe_video, timed_frames
 
 #: Pixels across the picture that flow is computed of, and cells across the flow that is kept.
-_ACROSS, _CELLS = 240, 24
+_ACROSS, _CELLS = 320, 24
 #: Degrees of the pinhole picture, at most: beyond it a flat picture is mostly edge.
 _MOST_VIEW = 105.0
 #: Degrees across a frame of which nothing is known: a phone's main camera filming video has 60 to 70.
