@@ -21,13 +21,17 @@ when they are read from a film, by the camera and by what it tells of itself? An
 bad films from good ones?
 
 ```bash
+cd experiments/film/raw
 for place in open_ground street furnished_room
-do egopose bench film --rounds 1 --json part=cameras place=$place stabilised=no > experiments/film/raw/cameras_$place.json
+do egopose bench film --json --rounds ROUNDS part=cameras place=$place stabilised=no > cameras_$place.json
 done
-egopose bench film --rounds 1 --json part=cameras stabilised=yes pitch=20 > experiments/film/raw/cameras_stabilised.json
-egopose bench film --rounds 1 --json part=clips,confidence > experiments/film/raw/clips.json
-python experiments/film/film.py
+egopose bench film --json --rounds ROUNDS part=cameras stabilised=yes pitch=20 > cameras_stabilised.json
+egopose bench film --json part=clips,confidence > clips.json
+python ../film.py
 ```
+
+ROUNDS, the seeds of each place, is {rounds} in these tables. Steadied pictures are filmed at one pitch only, to save
+time.
 
 How films and measures are made, and how to read the tables, is in [film-figures.md](../../docs/film-figures.md).
 """
@@ -51,7 +55,8 @@ def main() -> None:
             cells.append(f"{row[name]:.{digits}f} ({row[f'{name}_worst']:.{digits}f})")
         lines.append("| " + " | ".join(cells) + " |")
     told = f"{text}\n\n## Places, over all cameras\n\n" + "\n".join(lines) + "\n"
-    (HERE / "README.md").write_text(f"{HEAD}\n{told}")
+    rounds = str(min(one["rounds"] for one in raw if "cameras" in one))
+    (HERE / "README.md").write_text(HEAD.replace("{rounds}", rounds) + f"\n{told}")
     head = FIGURES.read_text().partition(MARK)[0]
     FIGURES.write_text(f"{head}{MARK}\n{told}")
 
