@@ -196,7 +196,7 @@ def _reweighted(
         normal = normal + prior * one[..., None] * _SHARED + tiny
         target = first_weighted @ first_moved[..., None] + second_weighted @ second_moved[..., None]
         fitted[:, first:] = np.linalg.solve(normal, target)[..., 0]
-    # Explained: across the motion by a third of a pixel in 240, or by a fifth of how far the point moved.
+    # Explained: across the motion by less than _PIXEL, or by a fifth of how far the point moved.
     far = np.hypot(moved[:, 0], moved[:, 1])
     explained = shown & (np.abs(across) < np.maximum(_EXPLAINED * far, _PIXEL))
     rigid = explained.sum(1) / np.maximum(shown.sum(1), 1)
