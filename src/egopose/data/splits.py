@@ -9,6 +9,9 @@ from egopose.core.config import convert
 from egopose.core.errors import InputError
 from egopose.data.store import PARTS, Fragment, TakeInfo
 
+#: Settings under which every frame of every take trains.
+WHOLE = {"kind": "time", "train_share": 1.0, "shortest": 1}
+
 
 def split_takes(
     takes: Sequence[TakeInfo], settings: Mapping[str, Any], part: str, supported_only: bool = True

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from tensordict import TensorDict
 from torch import Tensor
 
+from egopose.envs.mdp.path import lay, on_path, root_on_floor
 from egopose.envs.mdp.step_view import StepView
 from egopose.envs.problem import Problem
 from egopose.envs.starts import Starts
@@ -73,7 +74,7 @@ class EgoPoseTask(control.Task):
         self.problem, self.starts = problem, starts
         self._generator = torch.Generator().manual_seed(seed)
         self._take, self._start, self._stop, self._frame = (torch.zeros(1, dtype=torch.int64) for _ in range(4))
-        self._placed = torch.zeros(0)
+        self._placed, self._laid = torch.zeros(0), torch.zeros(1, 3, dtype=torch.float64)
         self.reward_terms: dict[str, float] = {}
 
     def initialize_episode(self, physics: HumanoidPhysics) -> None:
@@ -83,6 +84,8 @@ class EgoPoseTask(control.Task):
         qpos, qvel = self.problem.first_state(self._frame)
         physics.data.qpos[:], physics.data.qvel[:] = qpos[0].numpy(), qvel[0].numpy()
         self._placed = qpos[:, 7:]
+        if (path := self.problem.path_followed) is not None:
+            self._laid = lay(path[self._frame], root_on_floor(qpos))
         physics.diverged = False
 
     def before_step(self, action: NDArray[np.floating] | Tensor, physics: HumanoidPhysics) -> None:
@@ -97,6 +100,8 @@ class EgoPoseTask(control.Task):
     def get_observation(self, physics: HumanoidPhysics) -> OrderedDict[str, NDArray[Any]]:
         state = self._body_state(physics)
         seen = {key: value[0].numpy() for key, value in self.problem.observations(state, self._frame).items()}
+        if self.problem.path_followed is not None:
+            seen["root_on_path"] = on_path(self._laid, root_on_floor(state["qpos"]))[0].numpy()
         return OrderedDict(**seen, frame=self._frame.numpy().copy())
 
     def get_reward(self, physics: HumanoidPhysics) -> float:

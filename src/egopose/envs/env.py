@@ -15,6 +15,7 @@ from torchrl.data import Binary, Composite, Unbounded
 from torchrl.envs import EnvBase
 
 from egopose.envs.mdp.observations import BodyState, BodyView
+from egopose.envs.mdp.path import lay, on_path, root_on_floor
 from egopose.envs.mdp.step_view import Contacts, StepView
 from egopose.envs.problem import BODY_KEYS, Problem
 from egopose.envs.starts import Starts
@@ -94,7 +95,8 @@ class EgoPoseEnv(EnvBase):
     Time: a reset puts a world on reference frame s. A step applies the action (the PD target for frame s + 1), runs the
     physics to s + 1 and rewards the state there against the reference there.
 
-    Observations: the problem's, float32 and raw (``humanoid_state [115]`` of imitation); int64 ``frame [1]``,
+    Observations: the problem's, float32 and raw (``humanoid_state [115]`` of imitation), and ``root_on_path [3]`` where
+    the problem follows a path, which is laid where a world is placed; int64 ``frame [1]``,
     ``episode_start [1]`` and ``episode_stop [1]`` (global frames, stop exclusive), ``episode_step [1]``. Action:
     ``action [52]``. Reward: ``reward``, and ``reward_terms`` (nested, ``[1]`` each). Flags, bool ``[1]``: the problem's
     endings (``fallen``), ``diverged``, ``terminated`` (an ending that ends the episode, or diverged physics),
@@ -147,6 +149,7 @@ class EgoPoseEnv(EnvBase):
         self._take, self._start, self._stop, self._frame = np.zeros((4, num_envs), dtype=np.int64)
         self.placed = torch.zeros(num_envs, humanoid.mj_model.nu, dtype=torch.float64)
         self._targets = torch.zeros(num_envs, humanoid.mj_model.nu, dtype=torch.float64)
+        self._laid = torch.zeros(num_envs, 3, dtype=torch.float64)  # see egopose.envs.mdp.path
         self._unrewarded: list[_Unrewarded] | None = None
         self._earnings: list[Tensor] = []
         self._no_flags = _no_flags(problem.endings, self.batch_size)
@@ -159,6 +162,7 @@ class EgoPoseEnv(EnvBase):
         whole, flag = Unbounded((n, 1), dtype=torch.int64), Binary(1, (n, 1), dtype=torch.bool)
         self.observation_spec = Composite(
             **{k: Unbounded((n, size), dtype=torch.float32) for k, size in self.problem.observation_sizes.items()},
+            **({} if self.problem.path_followed is None else {"root_on_path": Unbounded((n, 3), dtype=torch.float32)}),
             frame=whole.clone(),
             episode_start=whole.clone(),
             episode_stop=whole.clone(),
@@ -279,6 +283,8 @@ class EgoPoseEnv(EnvBase):
         self.physics.set_state(worlds.numpy(), qpos.double().numpy(), qvel.double().numpy())
         if self.problem.remembers_start:
             self.placed[worlds] = qpos[:, 7:].double()
+        if (path := self.problem.path_followed) is not None:
+            self._laid[worlds] = lay(path[torch.from_numpy(self._frame)[worlds]], root_on_floor(qpos.double()))
 
     def observe(self, worlds: Tensor | slice = ALL) -> TensorDict:
         """The present observation of ``worlds [n]`` (default all), as a reset would return it (after :meth:`place`)."""
@@ -291,13 +297,19 @@ class EgoPoseEnv(EnvBase):
         frame = clock["frame"].squeeze(-1)
         return {
             **clock,
-            **self._observations(_Lazily(self.physics, rows), frame),
+            **self._observations(_Lazily(self.physics, rows), frame, rows),
             **self._terms(torch.zeros(len(frame), len(self.problem.reward.names))),
             **_no_flags(self.problem.endings, frame.shape),
         }
 
-    def _observations(self, state: BodyState | BodyView, frame: Tensor) -> dict[str, Tensor]:
-        return {key: value.float() for key, value in self.problem.observations(state, frame).items()}
+    def _observations(
+        self, state: BodyState | BodyView, frame: Tensor, worlds: NDArray[np.integer] | slice = ALL
+    ) -> dict[str, Tensor]:
+        seen = {key: value.float() for key, value in self.problem.observations(state, frame).items()}
+        if self.problem.path_followed is not None:
+            qpos = state.qpos if isinstance(state, BodyView) else state["qpos"]
+            seen["root_on_path"] = on_path(self._laid[worlds], root_on_floor(qpos)).float()
+        return seen
 
     def ongoing(self, after: Mapping[Any, Any], worlds: slice = ALL) -> dict[str, Tensor]:
         """Counters and flags of ``worlds`` in the entries ``after`` a step; those that are done begin a new episode."""
@@ -396,7 +408,7 @@ class EgoPoseEnv(EnvBase):
         flags = {"diverged": stopped, "terminated": terminated, "truncated": truncated, "done": done}
         return {
             **clock,
-            **self._observations(view.body, frame),
+            **self._observations(view.body, frame, worlds),
             "reward": reward,
             **terms,
             **{name: flag[:, None] for name, flag in endings.items()},
@@ -413,6 +425,7 @@ class EgoPoseEnv(EnvBase):
             "stop": torch.from_numpy(self._stop.copy()),
             "frame": torch.from_numpy(self._frame.copy()),
             **({"placed": self.placed.clone()} if self.problem.remembers_start else {}),
+            **({} if self.problem.path_followed is None else {"laid": self._laid.clone()}),
             **self.starts.state_dict(),
         }
 
@@ -430,6 +443,8 @@ class EgoPoseEnv(EnvBase):
         )
         if self.problem.remembers_start:
             self.placed = state_dict["placed"].clone()
+        if self.problem.path_followed is not None:
+            self._laid = state_dict["laid"].clone()
         self.starts.load_state_dict(state_dict)
 
     def close(self, *, raise_if_closed: bool = True) -> None:

@@ -81,6 +81,7 @@ class ImitationProblem:
         states: ``[F, 2 nq - 3]`` humanoid states that bodies follow at test time, or None.
         path: ``[F, 3]`` x, y (m) and heading (rad) of the root that they follow with the states; None for the path that
             the states' own velocities give.
+        shows_path: observations hold the root in the path's axes.
 
     Raises:
         ValueError: the reference does not fit the humanoid, or the action's table or the path is missing or of another
@@ -99,6 +100,7 @@ class ImitationProblem:
         forecasts: ReferenceForecasts | None = None,
         states: Tensor | None = None,
         path: Tensor | None = None,
+        shows_path: bool = False,
     ) -> None:
         if action.kind == "torque":
             humanoid = torque_driven(humanoid, action.joint_damping)
@@ -121,6 +123,7 @@ class ImitationProblem:
         self.endings: tuple[str, ...] = ("fallen",)
         self.ends_episode: frozenset[str] = frozenset(self.endings) if termination.enabled else frozenset()
         self.remembers_start = action.reference == "start"
+        self.path_followed: Tensor | None = None
         self.actions_move_targets = action.kind == "pd"
         self.watched: frozenset[str] = reward.needs
         self.n_frames = reference.shape[0]
@@ -134,6 +137,8 @@ class ImitationProblem:
         whole = BodyView(self.reference_at(torch.arange(self.n_frames)), self.layout)
         self._qpos, self._qvel = whole.qpos, whole.qvel
         self._rewarded = {name: getattr(whole, name).contiguous() for name in reward.reads}
+        if shows_path:
+            self.path_followed = self.followed().path
         self._range = torch.as_tensor(humanoid.joint_range, dtype=torch.float64).T
         self._rest = torch.as_tensor(humanoid.rest_action, dtype=torch.float64)
         self._table: Tensor | None = None

@@ -72,11 +72,14 @@ class TakeTable:
     lowest_head_height: Tensor
     groups: tuple[str, ...] = ()
 
+    def last(self) -> Tensor:
+        """``[F]`` int64, the last frame of each frame's take."""
+        return (self.offsets + self.lengths - 1).repeat_interleave(self.lengths)
+
     def following(self) -> Tensor:
         """``[F]`` int64, the frame after each frame; of a take's last frame, itself."""
         frames = torch.arange(int(self.lengths.sum()))
-        last = (self.offsets + self.lengths - 1).repeat_interleave(self.lengths)
-        return torch.minimum(frames + 1, last)
+        return torch.minimum(frames + 1, self.last())
 
 
 class Problem(Protocol):
@@ -90,6 +93,8 @@ class Problem(Protocol):
         endings: names of what :meth:`ended` gives.
         ends_episode: those of them that end an episode.
         remembers_start: whether targets depend on the joint angles a body was placed with.
+        path_followed: ``[F, 3]`` x, y (m) and heading (rad) of the path that observations compare the root with; None
+            where they do not. See :mod:`egopose.envs.mdp.path`.
         actions_move_targets: whether an action is added to PD targets; False where it is a torque.
         watched: the parts of a step beyond the body that rewards or endings read, of
             :data:`egopose.envs.mdp.rewards.PARTS`.
@@ -102,6 +107,7 @@ class Problem(Protocol):
     endings: tuple[str, ...]
     ends_episode: frozenset[str]
     remembers_start: bool
+    path_followed: Tensor | None
     actions_move_targets: bool
     watched: frozenset[str]
 

@@ -36,7 +36,7 @@ from egopose.inference.planner_settings import PlannerSettings
 from egopose.models.pose_regression import state_to_qpos
 
 _EPISODE = ("take", "start", "stop", "frame")  # with one number for each body
-_ROWS = ("placed", *(f"physics.{name}" for name in PER_WORLD))  # with more
+_ROWS = ("placed", "laid", *(f"physics.{name}" for name in PER_WORLD))  # with more
 
 _PARTS = (0.25, 0.5, 0.75)  # of the best candidate, tried in later rounds
 _ELITES = (2, 4, 8)  # candidates whose means are tried

@@ -10,13 +10,16 @@ from typing import Any
 import torch
 from tensordict import TensorDictBase
 
+from egopose.core.config import compose_config
 from egopose.data.preparation import fingerprint_of, flow_name, humanoid_of, prepare
-from egopose.data.splits import split_takes
+from egopose.data.splits import WHOLE, split_takes
 from egopose.data.store import TakeStore
 from egopose.envs.mdp.observations import humanoid_state
 from egopose.pipeline.regressor import kept_tables, regressor_tables
 from egopose.tasks.dataset import Dataset, require_same_store, take_table
 from egopose.tasks.task import task_of
+
+_SECOND = 30  # frames: what fragments of other sets have at least
 
 
 @dataclass(frozen=True)
@@ -39,6 +42,18 @@ class PreparedData:
         """See :class:`~egopose.tasks.task.Sources`."""
         store = prepare(self.config, progress=self.progress, flow=False)
         return replace(_motion_of(self.config, store), store_fingerprint=store.fingerprint)
+
+    def other_motions(self, name: str, folder: str) -> Dataset:
+        """See :class:`~egopose.tasks.task.Sources`.
+
+        Raises:
+            InputError: there is no such choice, or its motions cannot be used.
+        """
+        data = compose_config("train", [f"data={name}"])["data"]
+        config = {**self.config, "data": {**data, "folder": folder}}
+        store = prepare(config, progress=self.progress, flow=False)
+        train = split_takes(store.takes, {**WHOLE, "shortest": _SECOND}, "train")
+        return Dataset(humanoid_of(config), store.reference, take_table(store.takes), train, ())
 
     def seen_motions(self) -> Dataset:
         """See :class:`~egopose.tasks.task.Sources`.

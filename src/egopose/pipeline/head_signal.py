@@ -11,13 +11,12 @@ from egopose.checkpoint.head_signal import save_head_signal_regressor
 from egopose.core.config import compose_config, convert, from_mapping
 from egopose.core.errors import InputError
 from egopose.data.preparation import humanoid_of, prepare
-from egopose.data.splits import split_takes
+from egopose.data.splits import WHOLE, split_takes
 from egopose.motion.rotations import Array
 from egopose.training.head_signal_figures import held_out_figures
 from egopose.training.head_signal_regressor import HeadSignalSettings, train_head_signal_regressor
 
 _SOURCE = "conf/head_signal.yaml"
-_WHOLE = {"kind": "time", "train_share": 1.0, "shortest": 1}
 
 
 def motions_of(values: Mapping[str, Any]) -> tuple[list[Array], list[Array]]:
@@ -40,7 +39,7 @@ def motions_of(values: Mapping[str, Any]) -> tuple[list[Array], list[Array]]:
         config = compose_config("train", [f"data={name}"])
         config["data"]["folder"] = convert(folder, str, _SOURCE, f"sources.{name}")
         store = prepare({**config, "humanoid": values["humanoid"], "sim": values["sim"]}, flow=False)
-        split = _WHOLE if name in whole else config["data"]["split"]
+        split = WHOLE if name in whole else config["data"]["split"]
         for part, motions in (("train", train), ("test", test)):
             if part == "test" and name in whole:
                 continue

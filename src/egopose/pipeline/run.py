@@ -17,7 +17,13 @@ import torch
 from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import TransformedEnv
 
-from egopose.collection.collectors import CollectorSettings, build_collector, transform_state
+from egopose.checkpoint.checkpoint import ComponentState, RunCheckpoint, find_checkpoint, require, verify
+from egopose.collection.collectors import (
+    CollectorSettings,
+    build_collector,
+    load_transform_state,
+    transform_state,
+)
 from egopose.core.errors import InputError
 from egopose.core.runtime import settle_heap
 from egopose.envs.mdp.observations import humanoid_state
@@ -30,7 +36,7 @@ from egopose.training.loop import Evaluation, LoopSettings, Run, interrupts_held
 from egopose.training.ppo import PPO, PPOSettings
 from egopose.training.survival import frames_survived
 
-_LOOP_IN_ALGO = ("iterations", "steps_per_iteration")
+_LOOP_IN_ALGO = ("iterations", "steps_per_iteration", "critic_first")
 _LOOP_IN_TRAINING = ("total_steps", "max_seconds", "checkpoint_every", "keep_last", "evaluate_every")
 
 
@@ -41,6 +47,7 @@ def build_run(config: Mapping[str, Any], folder: Path, dataset: Dataset) -> Run:
         InputError: a setting is missing, unknown or out of range.
     """
     algo, training = dict(config["algo"]), config["training"]
+    algo.setdefault("critic_first", 0)  # runs from before this setting
     loop = {name: algo.pop(name, ...) for name in _LOOP_IN_ALGO}
     loop |= {name: training.get(name, ...) for name in _LOOP_IN_TRAINING}
     settings = LoopSettings.from_config(loop)
@@ -66,8 +73,25 @@ def build_run(config: Mapping[str, Any], folder: Path, dataset: Dataset) -> Run:
         ppo: PPO = _adversarial(config, dataset, actor, critic, ppo_settings)
     else:
         ppo = PPO(actor, critic, ppo_settings)
+    if training.get("start_from") is not None:
+        _start_from(str(training["start_from"]), ppo, collector, action_size)
     settle_heap()
     return Run(ppo, collector, settings, collector_settings, folder, config, action_size)
+
+
+def _start_from(path: str, ppo: PPO, collector: Any, action_size: int) -> None:
+    """Begin with the policy and the normaliser of another run; its critic and its optimisers stay behind.
+
+    Raises:
+        InputError: there is no such run, or its networks are of another shape.
+    """
+    folder = find_checkpoint(path, "latest")
+    require(verify(folder), folder, action_size=action_size)
+    saved: dict[str, Any] = {}
+    parts = {"policy": ppo.actor, "transforms": ComponentState(dict, saved.update)}
+    RunCheckpoint(parts).restore(folder, set(parts))
+    load_transform_state(collector, saved)
+    collector.update_policy_weights_()
 
 
 def _adversarial(

@@ -15,9 +15,13 @@ from egopose.envs.mdp.rewards import build_reward
 from egopose.envs.problem import Problem
 from egopose.envs.start_shares import StartShares
 from egopose.envs.starts import Starts, WholeFragments, training_starts
+from egopose.envs.target_window import TargetWindow
 from egopose.envs.transforms import StateNormalizer, VisualContext
 from egopose.tasks.dataset import Dataset, smoothed
 from egopose.tasks.task import Sources
+
+#: The observation of what lies ahead in the target motion, see :mod:`egopose.envs.target_window`.
+WINDOW = "target_window"
 
 
 class ImitationTask:
@@ -60,16 +64,26 @@ class ImitationTask:
             dataset.forecasts,
             dataset.states,
             dataset.path,
+            WINDOW in config["model"]["inputs"],
         )
 
     def transforms(self, config: Mapping[str, Any], dataset: Dataset, problem: Problem) -> list[Transform]:
-        """The visual context, if it is the regressor's, and the state's normaliser."""
-        normalizer = StateNormalizer(problem.observation_sizes["humanoid_state"])
-        if config["model"]["context"]["source"] != "frozen":
-            return [normalizer]
-        if dataset.visual_context is None:
-            raise InputError("configuration", "model.context.source", "frozen needs a trained state regressor")
-        return [VisualContext(dataset.visual_context), normalizer]
+        """The visual context, if it is the regressor's, the target motion's window, if it is read, and the state's
+        normaliser."""
+        transforms: list[Transform] = [StateNormalizer(problem.observation_sizes["humanoid_state"])]
+        if WINDOW in config["model"]["inputs"]:
+            transforms.insert(0, self._window(config, dataset, problem))
+        if config["model"]["context"]["source"] == "frozen":
+            if dataset.visual_context is None:
+                raise InputError("configuration", "model.context.source", "frozen needs a trained state regressor")
+            transforms.insert(0, VisualContext(dataset.visual_context))
+        return transforms
+
+    def _window(self, config: Mapping[str, Any], dataset: Dataset, problem: Problem) -> TargetWindow:
+        if dataset.states is None or problem.path_followed is None:
+            raise InputError("configuration", "model.inputs", f"{WINDOW} needs states to follow and their path")
+        ahead = tuple(int(frames) for frames in config["task"]["ahead"])
+        return TargetWindow(dataset.states, problem.path_followed, dataset.takes.last(), ahead)
 
     def starts(
         self, config: Mapping[str, Any], problem: Problem, fragments: Sequence[FragmentLike], whole_fragments: bool

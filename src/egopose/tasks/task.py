@@ -36,6 +36,10 @@ class Sources(Protocol):
         """Humanoid, reference and fragments: no video is rendered or looked at."""
         ...
 
+    def other_motions(self, name: str, folder: str) -> Dataset:
+        """:meth:`motions` of another choice of ``conf/data`` in ``folder``, all of its takes for training."""
+        ...
+
     def seen_motions(self) -> Dataset:
         """:meth:`motions` with what the state regressor sees in the wearer's videos."""
         ...

@@ -41,6 +41,7 @@ class LoopSettings:
     Args:
         iterations: of collection and update.
         steps_per_iteration: control steps over all worlds.
+        critic_first: iterations in which the critic alone learns, for a policy that was taught before.
         total_steps: stop at this many control steps, None for no limit besides ``iterations``.
         max_seconds: stop before the iteration that would end later than this, counted from the start of this process's
             training; None for no limit.
@@ -51,6 +52,7 @@ class LoopSettings:
 
     iterations: int
     steps_per_iteration: int
+    critic_first: int
     total_steps: int | None
     max_seconds: float | None
     checkpoint_every: int
@@ -299,6 +301,7 @@ def iterate(run: Run, batches: Iterator[TensorDictBase]) -> dict[str, float]:
     collectors.set_threads(threads.update_threads)
     rows = run.ppo.advantages(batch)
     clock.append(time.monotonic())
+    run.ppo.policy_held = counters.iteration < run.settings.critic_first
     try:
         learning = run.ppo.update(rows)
     finally:

@@ -139,6 +139,8 @@ class PPO:
         if settings.target_kl is not None:
             low, high = settings.policy_lr_range
             self.step_size = KLAdaptiveLR(self.policy_optimizer, settings.target_kl, min_lr=low, max_lr=high)
+        #: Whether the critic alone learns.
+        self.policy_held = False
         self._nonfinite_in_a_row = 0
 
     @torch.no_grad()
@@ -201,7 +203,7 @@ class PPO:
                 first = minibatches[0]
                 kl = self.divergence(rows if first is None else rows[first])
                 # TorchRL raises where it is not finite. One that overflowed is too large; NaN is `_gradient_step`'s.
-                if self.step_size is not None and not math.isnan(kl):
+                if self.step_size is not None and not math.isnan(kl) and not self.policy_held:
                     self.step_size.step(min(kl, torch.finfo(torch.float32).max))
         out = {name: float(torch.stack(values).mean()) for name, values in sums.items()}
         return out | {
@@ -265,7 +267,8 @@ class PPO:
             return None
         self._nonfinite_in_a_row = 0
         self.value_optimizer.step()
-        self.policy_optimizer.step()
+        if not self.policy_held:
+            self.policy_optimizer.step()
         return {
             "policy_loss": policy_loss.detach(),
             "roughness": roughness.detach(),

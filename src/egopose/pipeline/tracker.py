@@ -1,0 +1,261 @@
+"""Teaching a tracker by ``conf/tracker.yaml``: rounds of lessons and of learning, to a policy PPO can begin with."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import nn
+
+from egopose.checkpoint.checkpoint import NOT_JUDGED, ComponentState, RunCheckpoint, metadata_of
+from egopose.checkpoint.resume import only_process
+from egopose.collection.collectors import transform_state
+from egopose.core.config import from_mapping
+from egopose.core.errors import InputError
+from egopose.core.torch_settings import torch_threads
+from egopose.envs.imitation import ImitationProblem
+from egopose.envs.starts import Piece
+from egopose.envs.transforms import StateNormalizer
+from egopose.humanoid.derivatives import Simulator
+from egopose.humanoid.inverse_dynamics import ForceSettings
+from egopose.humanoid.trajectory import TrackingCost
+from egopose.models.policy import GaussianHead
+from egopose.motion.rotations import Array
+from egopose.pipeline.dataset import absolute_paths, load_dataset
+from egopose.pipeline.environment import build_env
+from egopose.pipeline.run import build_run
+from egopose.tasks.dataset import Dataset
+from egopose.tasks.tracking import clips_of
+from egopose.training.cloning import CloningSettings, LessonReader, clone
+from egopose.training.loop import Run
+from egopose.training.survival import base_tracking, frames_survived
+from egopose.training.teacher import Lessons, Student, TeacherSettings, chunks, teach, teachers_motion
+
+_SOURCE = "conf/tracker.yaml"
+_OWN = ("out", "rounds", "shard", "seed", "teacher", "cloning")
+_SIMULATED = 1024  # worlds of the teacher's simulator
+
+
+@dataclass(frozen=True)
+class _Teaching:
+    """What every round of one teaching shares."""
+
+    values: Mapping[str, Any]
+    run: Run
+    dataset: Dataset
+    problem: ImitationProblem
+    teacher: TeacherSettings
+    cloning: CloningSettings
+    copies: int
+    clips: int
+
+    @property
+    def out(self) -> Path:
+        return Path(str(self.values["out"])).expanduser()
+
+    def weights(self, number: int) -> Path:
+        """Policy and normaliser after a round, as a checkpoint."""
+        return self.out / f"round_{number}"
+
+    def checkpoint(self) -> RunCheckpoint:
+        """The components of :meth:`weights`, bound to the live objects."""
+        env = self.run.collector.env
+        transforms = ComponentState(env.state_dict, env.load_state_dict)
+        return RunCheckpoint({"policy": self.run.ppo.actor, "transforms": transforms})
+
+    @property
+    def head(self) -> GaussianHead:
+        """The policy's network."""
+        heads = [module for module in self.run.ppo.actor.modules() if isinstance(module, GaussianHead)]
+        return heads[0]
+
+    @property
+    def normalizer(self) -> StateNormalizer:
+        env = self.run.collector.env
+        found = [module for module in env.transform.modules() if isinstance(module, StateNormalizer)]
+        return found[0]
+
+
+def train_tracker(values: Mapping[str, Any]) -> None:
+    """Run ``conf/tracker.yaml``, resolved. What is there already is not made again.
+
+    Raises:
+        InputError: a setting or the data cannot be used, or another process works in the folder.
+    """
+    out = Path(str(values["out"])).expanduser()
+    with only_process(out):
+        teaching = _prepared(values)
+        try:
+            for number in range(int(values["rounds"])):
+                _round(teaching, number)
+            print(f"policy: {teaching.weights(int(values['rounds']) - 1)}", flush=True)
+        finally:
+            teaching.run.collector.shutdown()
+
+
+def _prepared(values: Mapping[str, Any]) -> _Teaching:
+    teacher = dict(values["teacher"])
+    teacher["cost"] = from_mapping(TrackingCost, teacher["cost"], f"{_SOURCE}: teacher.cost")
+    teacher["forces"] = from_mapping(ForceSettings, teacher["forces"], f"{_SOURCE}: teacher.forces")
+    settings = from_mapping(TeacherSettings, teacher, f"{_SOURCE}: teacher")
+    cloning = from_mapping(CloningSettings, values["cloning"], f"{_SOURCE}: cloning")
+    config = absolute_paths({key: value for key, value in values.items() if key not in (*_OWN, "experiment")})
+    config["seed"] = values["seed"]
+    if config["task"]["name"] != "tracking":
+        raise InputError(_SOURCE, "task", f"a teacher follows motion: task=tracking, not {config['task']['name']!r}")
+    dataset = load_dataset(config)
+    run = build_run(config, Path(str(values["out"])).expanduser() / "policy", dataset)
+    problem = run.collector.env.base_env.problem
+    sides = 1 + bool(config["task"]["mirror"])
+    copies = len(config["task"]["errors"])
+    return _Teaching(
+        values, run, dataset, problem, settings, cloning, copies, len(dataset.takes.offsets) // (copies * sides)
+    )
+
+
+def _round(teaching: _Teaching, number: int) -> None:
+    """Lessons of a round, and what the policy learns from those of all rounds so far."""
+    lessons = [_lessons(teaching, earlier) for earlier in range(number)]
+    weights = teaching.weights(number)
+    if weights.is_dir():
+        teaching.checkpoint().restore(weights)
+        return
+    lessons.append(_lessons(teaching, number))
+    whole = Lessons.joined(lessons)
+    dataset, task = teaching.dataset, teaching.run.config["task"]
+    assert dataset.states is not None
+    assert dataset.path is not None
+    reader = LessonReader(
+        whole,
+        teaching.problem,
+        dataset.states,
+        dataset.path,
+        dataset.takes.last(),
+        tuple(int(frames) for frames in task["ahead"]),
+        teaching.copies,
+        bool(task["mirror"]),
+        teaching.cloning,
+        int(teaching.values["seed"]) + number,
+    )
+    if number == 0:
+        _set_statistics(teaching, reader)
+
+    def tell(step: int, error: float, seconds: float) -> None:
+        print(f"round {number}, step {step}, error {error:.4f} rad, {seconds:.0f} s", file=sys.stderr, flush=True)
+
+    threads = int(teaching.run.config["collector"]["update_threads"])
+    with torch_threads(threads):
+        clone(_Mean(teaching.head), teaching.normalizer.normalize, reader, teaching.cloning, tell)
+    _judge(teaching, number)
+    run = teaching.run
+    teaching.checkpoint().save(weights, metadata=metadata_of(run.task, run.action_size, 0, 0, NOT_JUDGED))
+
+
+class _Mean(nn.Module):
+    """The mean of a Gaussian policy, in bfloat16 products where the processor has them."""
+
+    def __init__(self, head: GaussianHead) -> None:
+        super().__init__()
+        self.head = head
+
+    def forward(self, state: torch.Tensor, window: torch.Tensor) -> torch.Tensor:
+        with torch.autocast("cpu", torch.bfloat16):
+            mean: torch.Tensor = self.head(state, window)[0]
+        return mean.float()
+
+
+def _lessons(teaching: _Teaching, number: int) -> Lessons:
+    """The lessons of a round, those that are missing made and kept in ``out/lessons_K``."""
+    folder, values, dataset = teaching.out / f"lessons_{number}", teaching.values, teaching.dataset
+    folder.mkdir(parents=True, exist_ok=True)
+    own = [Piece(f.take, f.start, f.stop) for f in dataset.train if f.take < teaching.clips]
+    pieces = chunks(own, dataset.takes.offsets.tolist(), teaching.teacher.chunk)
+    order = np.random.default_rng([int(values["seed"]), number]).permutation(len(pieces))
+    shards = np.array_split(order, max(1, len(pieces) // int(values["shard"])))
+    files = [folder / f"{index:04d}.npz" for index in range(len(shards))]
+    missing = [index for index, file in enumerate(files) if not file.is_file()]
+    if missing:
+        clips = clips_of(dataset)[: teaching.clips]
+        motion = teachers_motion(dataset.humanoid, clips, teaching.teacher.forces)
+        threads = int(teaching.run.config["collector"]["physics_threads"])
+        simulator = Simulator(dataset.humanoid, _SIMULATED, threads)
+        student = _student(teaching) if number else None
+        for index in missing:
+            rng = np.random.default_rng([int(values["seed"]), number, index])
+            these = [pieces[piece] for piece in shards[index].tolist()]
+            lessons, lost = teach(dataset.humanoid, motion, these, teaching.teacher, simulator, rng, student)
+            part = files[index].with_suffix(".part.npz")
+            np.savez(part, **{f.name: getattr(lessons, f.name) for f in fields(lessons)})
+            os.replace(part, files[index])
+            told = f"round {number}, lessons {index + 1} of {len(files)}: {len(lessons)}, bodies lost {lost}"
+            print(told, file=sys.stderr, flush=True)
+        simulator.close()
+    return Lessons.joined([_read(file) for file in files])
+
+
+def _read(path: Path) -> Lessons:
+    """Raises InputError: the file is no lessons."""
+    try:
+        with np.load(path, allow_pickle=False) as arrays:
+            return Lessons(**{f.name: arrays[f.name] for f in fields(Lessons)})
+    except (OSError, ValueError, KeyError) as error:
+        raise InputError(path, "lessons", f"is damaged: {error}; remove it and give the command again") from None
+
+
+def _set_statistics(teaching: _Teaching, reader: LessonReader) -> None:
+    """The normaliser's, as if it had seen a million states as those of the lessons."""
+    states = torch.from_numpy(reader.draw(20_000)[0])
+    normalizer, count = teaching.normalizer, 1_000_000
+    normalizer.count.fill_(count)
+    normalizer.mean.copy_(states.mean(0))
+    normalizer.sum_of_squares.copy_((states.var(0) + 1e-6) * (count - 1))
+
+
+def _student(teaching: _Teaching) -> Student:
+    """The policy as it stands, as the teacher's student."""
+    dataset, task, problem = teaching.dataset, teaching.run.config["task"], teaching.problem
+    assert dataset.states is not None
+    assert dataset.path is not None
+    states, path, last = dataset.states, dataset.path, dataset.takes.last()
+    ahead = tuple(int(frames) for frames in task["ahead"])
+    # Sees what is followed as it is, in the first copies.
+    reader = LessonReader(
+        None,
+        problem,
+        states,
+        path,
+        last,
+        ahead,
+        teaching.copies,
+        bool(task["mirror"]),
+        teaching.cloning,
+        0,
+    )
+    mean = _Mean(teaching.head)
+
+    @torch.no_grad()
+    def act(frame: NDArray[np.int64], qpos: Array, qvel: Array) -> Array:
+        state, window = reader.seen(frame, qpos, qvel)
+        seen = teaching.normalizer.normalize(torch.from_numpy(state)).float()
+        action = mean(seen, torch.from_numpy(window))
+        return problem.target(action, torch.from_numpy(reader.next(frame))).numpy()
+
+    return act
+
+
+def _judge(teaching: _Teaching, number: int) -> None:
+    """Frames survived by the policy's mean action and by the zero action, told."""
+    config = teaching.run.config
+    env = build_env(config, teaching.dataset, "test", num_envs=128, threads=int(config["collector"]["physics_threads"]))
+    env.load_state_dict(transform_state(teaching.run.collector))
+    for name, controller in (("policy", teaching.run.ppo.actor), ("zero action", base_tracking(env))):
+        survival = frames_survived(env, controller, int(config["training"]["evaluation_seed"]))
+        print(f"round {number}, held-out people: {name} survives {survival.mean:.1f} frames", flush=True)
+    env.close()

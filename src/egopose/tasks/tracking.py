@@ -1,0 +1,100 @@
+"""Following any kinematic motion with a simulated body: the one policy behind estimates, forecasts and reconstructions.
+
+The policy sees the body, and where the motion it follows goes next (:mod:`egopose.envs.target_window`). It sees no
+video. It is trained on motion capture with errors as a regressor makes them, and paid for the truth.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+import torch
+
+from egopose.core.config import convert, from_mapping
+from egopose.core.errors import InputError
+from egopose.envs.imitation import ActionSettings
+from egopose.envs.mdp.rewards import build_reward
+from egopose.envs.starts import Piece
+from egopose.envs.tracking import TrackingEndings, TrackingProblem
+from egopose.motion.rotations import Array
+from egopose.tasks.dataset import Dataset
+from egopose.tasks.imitation import WINDOW, ImitationTask
+from egopose.tasks.target_variants import TargetError, target_variants
+from egopose.tasks.task import Sources
+
+
+class Tracking(ImitationTask):
+    """Bodies follow motion capture with errors on top."""
+
+    name, protocol = "tracking", "survival"
+
+    def check(self, config: Mapping[str, Any]) -> None:
+        """Raises InputError: the policy cannot see what it should follow."""
+        if WINDOW not in config["model"]["inputs"]:
+            raise InputError("configuration", "model.inputs", f"a tracker follows {WINDOW}: model=tracking")
+
+    def dataset(self, config: Mapping[str, Any], sources: Sources) -> Dataset:
+        """Every training clip with each error of ``task.errors``, and its mirror image; test clips without errors.
+
+        Clips of the sets ``task.also`` train as well.
+
+        Raises:
+            InputError: an error's setting is missing or wrong, or a set cannot be used.
+        """
+        task = config["task"]
+        errors = [
+            None if row is None else from_mapping(TargetError, row, f"task.errors.{name}")
+            for name, row in task["errors"].items()
+        ]
+        motions = sources.motions()
+        clips, train = clips_of(motions), list(motions.train)
+        for name, folder in task["also"].items():
+            if folder is not None:
+                other = sources.other_motions(name, str(folder))
+                train += [Piece(len(clips) + f.take, f.start, f.stop) for f in other.train]
+                clips += clips_of(other)
+        mirror, seed = convert(task["mirror"], bool, "task", "mirror"), int(task["errors_seed"])
+        fragments = [*train, *motions.test]
+        whole = target_variants(motions.humanoid, clips, fragments, errors, mirror, seed)
+        trains = len(train)
+        rounds = range(0, len(whole.pieces), len(fragments))
+        return replace(
+            motions,
+            reference=whole.reference,
+            takes=whole.takes,
+            train=[piece for at in rounds for piece in whole.pieces[at : at + trains]],
+            test=whole.first[trains:],
+            joint_targets=whole.joint_targets,
+            states=whole.states,
+            path=whole.path,
+        )
+
+    def problem(self, config: Mapping[str, Any], dataset: Dataset, endings_end: bool | None) -> TrackingProblem:
+        """See :class:`~egopose.tasks.task.Task`."""
+        task = config["task"]
+        termination = {**task["termination"], **({} if endings_end is None else {"enabled": endings_end})}
+        assert dataset.states is not None
+        assert dataset.path is not None
+        return TrackingProblem(
+            dataset.humanoid,
+            dataset.reference,
+            dataset.takes,
+            build_reward(config["reward"]),
+            ActionSettings(**task["action"]),
+            from_mapping(TrackingEndings, termination, "task.termination"),
+            torch.as_tensor(dataset.joint_targets),
+            dataset.states,
+            dataset.path,
+        )
+
+
+def clips_of(dataset: Dataset) -> list[Array]:
+    """``qpos [T, nq]`` of every take; copies, as a store's own are mapped from its files."""
+    offsets, lengths = dataset.takes.offsets.tolist(), dataset.takes.lengths.tolist()
+    qpos = dataset.reference["qpos"]
+    return [qpos[a : a + n].numpy().copy() for a, n in zip(offsets, lengths, strict=True)]
+
+
+TASK = Tracking()
