@@ -98,7 +98,7 @@ class Variants:
         joint_targets: ``[F, nu]`` rad, their joint angles.
         path: ``[F, 3]`` x, y (m) and heading (rad) of their root.
         pieces: fragments of all takes.
-        first: fragments of the first take of each clip, which is followed without an error.
+        unmirrored: those of no mirror image, error by error.
     """
 
     reference: TensorDict
@@ -107,7 +107,7 @@ class Variants:
     joint_targets: Tensor
     path: Tensor
     pieces: list[Piece]
-    first: list[Piece]
+    unmirrored: list[Piece]
 
 
 def target_variants(
@@ -131,7 +131,7 @@ def target_variants(
     rng, fps = np.random.default_rng(seed), 1.0 / humanoid.control_dt
     references, states, targets, paths, lengths, lowest = [], [], [], [], [], []
     pieces: list[Piece] = []
-    first: list[Piece] = []
+    unmirrored: list[Piece] = []
     for side in range(1 + mirror):
         truths = [mirrored(humanoid, clip) for clip in clips] if side else list(clips)
         bodies = [reference_states(humanoid, Motion(humanoid.skeleton, truth, fps)) for truth in truths]
@@ -150,9 +150,9 @@ def target_variants(
                 lowest.append(float(body["xpos"][:, humanoid.head, 2].min()))
             these = [Piece(begun + f.take, f.start, f.stop) for f in fragments]
             pieces += these
-            first += these if error is None and not side else []
+            unmirrored += [] if side else these
     sizes = torch.tensor(lengths)
     takes = TakeTable(sizes.cumsum(0) - sizes, sizes, torch.tensor(lowest, dtype=torch.float64))
     return Variants(
-        torch.cat(references), takes, torch.cat(states), torch.cat(targets), torch.cat(paths), pieces, first
+        torch.cat(references), takes, torch.cat(states), torch.cat(targets), torch.cat(paths), pieces, unmirrored
     )

@@ -36,7 +36,7 @@ class Tracking(ImitationTask):
             raise InputError("configuration", "model.inputs", f"a tracker follows {WINDOW}: model=tracking")
 
     def dataset(self, config: Mapping[str, Any], sources: Sources) -> Dataset:
-        """Every training clip with each error of ``task.errors``, and its mirror image; test clips without errors.
+        """Every training clip with each error of ``task.errors``, and its mirror image; test clips with each error.
 
         Clips of the sets ``task.also`` train as well.
 
@@ -59,13 +59,12 @@ class Tracking(ImitationTask):
         fragments = [*train, *motions.test]
         whole = target_variants(motions.humanoid, clips, fragments, errors, mirror, seed)
         trains = len(train)
-        rounds = range(0, len(whole.pieces), len(fragments))
         return replace(
             motions,
             reference=whole.reference,
             takes=whole.takes,
-            train=[piece for at in rounds for piece in whole.pieces[at : at + trains]],
-            test=whole.first[trains:],
+            train=_part(whole.pieces, len(fragments), slice(trains)),
+            test=_part(whole.unmirrored, len(fragments), slice(trains, None)),
             joint_targets=whole.joint_targets,
             states=whole.states,
             path=whole.path,
@@ -88,6 +87,11 @@ class Tracking(ImitationTask):
             dataset.states,
             dataset.path,
         )
+
+
+def _part(pieces: list[Piece], count: int, part: slice) -> list[Piece]:
+    """The same ``part`` of every ``count`` pieces."""
+    return [piece for at in range(0, len(pieces), count) for piece in pieces[at : at + count][part]]
 
 
 def clips_of(dataset: Dataset) -> list[Array]:
