@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -43,7 +43,7 @@ class PreparedData:
         store = prepare(self.config, progress=self.progress, flow=False)
         return replace(_motion_of(self.config, store), store_fingerprint=store.fingerprint)
 
-    def other_motions(self, name: str, folder: str) -> Dataset:
+    def other_motions(self, name: str, folder: str, subjects: Sequence[str] | None) -> Dataset:
         """See :class:`~egopose.tasks.task.Sources`.
 
         Raises:
@@ -52,7 +52,7 @@ class PreparedData:
         data = compose_config("train", [f"data={name}"])["data"]
         config = {**self.config, "data": {**data, "folder": folder}}
         store = prepare(config, progress=self.progress, flow=False)
-        train = split_takes(store.takes, {**WHOLE, "shortest": _SECOND}, "train")
+        train = split_takes(store.takes, {**WHOLE, "shortest": _SECOND, "subjects": subjects}, "train")
         return Dataset(humanoid_of(config), store.reference, take_table(store.takes), train, ())
 
     def seen_motions(self) -> Dataset:

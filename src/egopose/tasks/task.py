@@ -36,8 +36,8 @@ class Sources(Protocol):
         """Humanoid, reference and fragments: no video is rendered or looked at."""
         ...
 
-    def other_motions(self, name: str, folder: str) -> Dataset:
-        """:meth:`motions` of another choice of ``conf/data`` in ``folder``, all of its takes for training."""
+    def other_motions(self, name: str, folder: str, subjects: Sequence[str] | None) -> Dataset:
+        """:meth:`motions` of another choice of ``conf/data`` in ``folder``, all takes of ``subjects`` for training."""
         ...
 
     def seen_motions(self) -> Dataset:

@@ -7,7 +7,7 @@ video. It is trained on motion capture with errors as a regressor makes them, an
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -23,6 +23,14 @@ from egopose.tasks.dataset import Dataset
 from egopose.tasks.imitation import WINDOW, ImitationTask
 from egopose.tasks.target_variants import TargetError, target_variants
 from egopose.tasks.task import Sources
+
+
+@dataclass(frozen=True)
+class _OtherSet:
+    """A row of ``task.also``: the folder of a choice of ``conf/data``, None for not used; subjects, None for all."""
+
+    folder: str | None
+    subjects: tuple[str, ...] | None
 
 
 class Tracking(ImitationTask):
@@ -50,9 +58,10 @@ class Tracking(ImitationTask):
         ]
         motions = sources.motions()
         clips, train = clips_of(motions), list(motions.train)
-        for name, folder in task["also"].items():
-            if folder is not None:
-                other = sources.other_motions(name, str(folder))
+        for name, row in task["also"].items():
+            also = from_mapping(_OtherSet, row, f"task.also.{name}")
+            if also.folder is not None:
+                other = sources.other_motions(name, also.folder, also.subjects)
                 train += [Piece(len(clips) + f.take, f.start, f.stop) for f in other.train]
                 clips += clips_of(other)
         mirror, seed = convert(task["mirror"], bool, "task", "mirror"), int(task["errors_seed"])
