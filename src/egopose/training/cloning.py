@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from egopose.envs.imitation import ImitationProblem
 from egopose.envs.mdp.observations import humanoid_state_rows
 from egopose.envs.target_window import Rows, target_window
-from egopose.humanoid.derivatives import moved
+from egopose.humanoid.derivatives import Single, moved
 from egopose.models.mirror import joint_mirror
 from egopose.motion import rotations as rot
 from egopose.motion.rotations import Array
@@ -91,6 +91,8 @@ class LessonReader:
         self._lessons, self._problem, self._settings = lessons, problem, settings
         self._states, self._path, self._last = states.numpy(), path.numpy(), last.numpy()
         self._ahead, self._copies, self._mirror = np.array(ahead), copies, mirror
+        # Half precision is for the disk: to convert it at every draw takes longer than all else.
+        self._gains = np.zeros(0, dtype=np.float32) if lessons is None else lessons.gains.astype(np.float32)
         self._frames = len(self._last) // (copies * (1 + mirror))
         self._rng = np.random.default_rng(seed)
         index, sign = joint_mirror(problem.humanoid.skeleton)
@@ -108,7 +110,7 @@ class LessonReader:
         nv = qvel.shape[1]
         size = rng.random((count, 1)) * (rng.random((count, 1)) < settings.nearby)
         move = size * self._deviations * rng.normal(size=(count, 2 * nv))
-        change = np.einsum("nij,nj->ni", lessons.gains[rows].astype(np.float32), move.astype(np.float32))
+        change = _times(self._gains, rows, move.astype(np.float32))
         ctrl += np.clip(change, -settings.largest_change, settings.largest_change)
         qpos, qvel = moved(qpos, move[:, :nv]), qvel + move[:, nv:]
         side = np.zeros(count, dtype=np.int64)
@@ -136,6 +138,17 @@ class LessonReader:
         root = np.column_stack([qpos[:, :2], rot.yaw(qpos[:, 3:7])])
         rows = np.minimum(frame[:, None] + self._ahead, self._last[frame][:, None])
         return state, target_window(state, root, self._states[rows], self._path[rows])
+
+
+def _times(gains: np.ndarray, rows: np.ndarray, move: Single) -> Single:
+    """``gains[rows] [n, nu, 2 nv]`` times ``move [n, 2 nv]``, some at a time: whole they fill no cache."""
+    parts = range(0, len(rows), _AT_ONCE)
+    return np.concatenate(
+        [
+            (gains[rows[at : at + _AT_ONCE]].astype(np.float32) @ move[at : at + _AT_ONCE, :, None])[..., 0]
+            for at in parts
+        ]
+    )
 
 
 def clone(
@@ -173,3 +186,4 @@ def clone(
 
 
 _WARM_UP, _TOLD_EVERY = 200, 500  # steps
+_AT_ONCE = 64  # lessons whose gains are multiplied together
