@@ -17,7 +17,14 @@ import torch
 from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import TransformedEnv
 
-from egopose.checkpoint.checkpoint import ComponentState, RunCheckpoint, find_checkpoint, require, verify
+from egopose.checkpoint.checkpoint import (
+    ComponentState,
+    RunCheckpoint,
+    find_checkpoint,
+    has_component,
+    require,
+    verify,
+)
 from egopose.collection.collectors import (
     CollectorSettings,
     build_collector,
@@ -80,7 +87,7 @@ def build_run(config: Mapping[str, Any], folder: Path, dataset: Dataset) -> Run:
 
 
 def _start_from(path: str, ppo: PPO, collector: Any, action_size: int) -> None:
-    """Begin with the policy and the normaliser of another run; its critic and its optimisers stay behind.
+    """Begin with the policy, the normaliser and, where there is one, the critic of another run.
 
     Raises:
         InputError: there is no such run, or its networks are of another shape.
@@ -88,7 +95,9 @@ def _start_from(path: str, ppo: PPO, collector: Any, action_size: int) -> None:
     folder = find_checkpoint(path, "latest")
     require(verify(folder), folder, action_size=action_size)
     saved: dict[str, Any] = {}
-    parts = {"policy": ppo.actor, "transforms": ComponentState(dict, saved.update)}
+    parts: dict[str, Any] = {"policy": ppo.actor, "transforms": ComponentState(dict, saved.update)}
+    if has_component(folder, "critic"):
+        parts["critic"] = ppo.critic
     RunCheckpoint(parts).restore(folder, set(parts))
     load_transform_state(collector, saved)
     collector.update_policy_weights_()

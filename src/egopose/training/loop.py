@@ -68,8 +68,10 @@ class LoopSettings:
             if getattr(settings, name) < least:
                 raise InputError(source, name, f"must be at least {least}, not {getattr(settings, name)}")
         for name in ("total_steps", "max_seconds"):
-            if getattr(settings, name) is not None and getattr(settings, name) <= 0:
-                raise InputError(source, name, f"must be positive or null, not {getattr(settings, name)}")
+            value = getattr(settings, name)
+            # No step at all: a run that takes over another's policy as it is (training.start_from).
+            if value is not None and not (value > 0 or (name == "total_steps" and value == 0)):
+                raise InputError(source, name, f"must be positive or null, not {value}")
         return settings
 
 
