@@ -125,7 +125,7 @@ def _taken_apart(
     timed(env.transform, "_step", "transforms")
     timed(env.transform, "_reset", "resets")
     timed(base, "begin", "resets")
-    timed(ppo.loss, "forward", "losses")
+    timed(ppo, "_losses", "losses")
     timed(ppo, "divergence", "kl")
     for optimiser in (ppo.policy_optimizer, ppo.value_optimizer):
         timed(optimiser, "step", "optimisers")
