@@ -1,6 +1,7 @@
 """``python -m egopose.bench VERB [--json] [--rounds N] [key=value ...]``: measure the program's own parts.
 
 env: the speed of the collection loop beside MuJoCo's own.
+train: the speed of whole iterations of training beside MuJoCo's own.
 features: from an MP4 to visual features beside decoding alone.
 rates: tracking, energy and speed of coarser physics.
 scaling: the cost of every part of an iteration, and the memory of workers that share the data.

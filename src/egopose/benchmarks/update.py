@@ -5,18 +5,11 @@ from __future__ import annotations
 import statistics
 import time
 from collections import defaultdict
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
-import torch
-
-from egopose.collection.collectors import CollectorSettings, base_env, build_collector, set_threads
-from egopose.core.config import compose_config
-from egopose.core.runtime import settle_heap
-from egopose.pipeline.dataset import motion_dataset
-from egopose.pipeline.environment import build_env
-from egopose.pipeline.networks import build_networks
-from egopose.training.ppo import PPO, PPOSettings
+from egopose.benchmarks.iterations import Iterations, build_iterations
+from egopose.collection.collectors import base_env
 
 
 def run(overrides: Sequence[str], rounds: int) -> dict[str, Any]:
@@ -36,55 +29,29 @@ def run(overrides: Sequence[str], rounds: int) -> dict[str, Any]:
     Raises:
         InputError: a setting is unknown or out of range.
     """
-    config = compose_config("train", ["sim=paper", *overrides])
-    dataset = motion_dataset(config)
-    settings = CollectorSettings.from_config(config["collector"])
-    torch.manual_seed(0)
-    set_threads(settings.threads)
-    env = build_env(config, dataset, num_envs=settings.num_envs, threads=settings.physics_threads)
-    actor, critic = build_networks(config, dataset, env)
-    ppo = PPO(actor, critic, PPOSettings.from_config(config["algo"]))
-    collector = build_collector(settings, lambda _: env, actor, int(config["algo"]["steps_per_iteration"]))
-    settle_heap()
-    batches = iter(collector)
-
-    def iterate() -> tuple[float, float, float, int]:
-        clock = [time.perf_counter()]
-        set_threads(settings.threads)
-        batch = next(batches)
-        clock.append(time.perf_counter())
-        set_threads(settings.update_threads)
-        rows = ppo.advantages(batch)
-        clock.append(time.perf_counter())
-        ppo.update(rows)
-        clock.append(time.perf_counter())
-        return clock[1] - clock[0], clock[2] - clock[1], clock[3] - clock[2], len(rows)
-
+    iterations = build_iterations(overrides)
     try:
-        iterate()
-        measured = [iterate() for _ in range(rounds)]
-        collect, advantages, update, rows = (statistics.median(column) for column in zip(*measured, strict=True))
-        parts = _taken_apart(iterate, env, ppo, collector)
+        iterations.take()
+        measured = [iterations.take() for _ in range(rounds)]
+        parts = _taken_apart(iterations)
     finally:
-        collector.shutdown()
-    per_epoch = 1 if ppo.settings.minibatch_size is None else max(1, int(rows) // ppo.settings.minibatch_size)
+        iterations.collector.shutdown()
+    collect, advantages, update, rows = (statistics.median(column) for column in zip(*measured, strict=True))
     return {
-        "update_share": statistics.median((a + u) / (c + a + u) for c, a, u, _ in measured),
+        "update_share": statistics.median(1 - one.collect / one.seconds for one in measured),
         "collect_s": collect,
         "advantages_s": advantages,
         "update_s": update,
         "rows": int(rows),
-        "gradient_steps": ppo.settings.epochs * per_epoch,
-        "control_steps_per_s": statistics.median(n / (c + a + u) for c, a, u, n in measured),
-        "num_envs": settings.num_envs,
-        "substeps": base_env(env).physics.substeps,
+        "gradient_steps": iterations.gradient_steps(int(rows)),
+        "control_steps_per_s": statistics.median(one.steps / one.seconds for one in measured),
+        "num_envs": iterations.settings.num_envs,
+        "substeps": base_env(iterations.env).physics.substeps,
         "parts": parts,
     }
 
 
-def _taken_apart(
-    iterate: Callable[[], tuple[float, float, float, int]], env: Any, ppo: Any, collector: Any
-) -> dict[str, float]:
+def _taken_apart(iterations: Iterations) -> dict[str, float]:
     """Seconds of one iteration by part, each without the parts inside it.
 
     In collection these are the acting thread's: the physics' threads work beside it, and ``waiting_for_physics`` is
@@ -114,6 +81,7 @@ def _taken_apart(
 
         object.__setattr__(owner, name, outer)
 
+    env, ppo, collector = iterations.env, iterations.ppo, iterations.collector
     base = env.base_env
     timed(collector.policy, "act", "policy")
     timed(collector, "postproc", "policy")  # the actions' probabilities
@@ -125,11 +93,11 @@ def _taken_apart(
     timed(env.transform, "_step", "transforms")
     timed(env.transform, "_reset", "resets")
     timed(base, "begin", "resets")
-    timed(ppo.loss, "forward", "losses")
+    timed(ppo, "_losses", "losses")
     timed(ppo, "divergence", "kl")
     for optimiser in (ppo.policy_optimizer, ppo.value_optimizer):
         timed(optimiser, "step", "optimisers")
-    collect, advantages, update, _ = iterate()
+    collect, advantages, update, _ = iterations.take()
     in_update = ("losses", "kl", "optimisers")
     spent["gradients"] = update - sum(spent[part] for part in in_update)
     in_collection = set(spent) - {*in_update, "gradients"}

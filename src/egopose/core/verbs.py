@@ -24,6 +24,7 @@ FORMER = {"ship": "package"}
 #: The measurements of ``egopose bench`` and the default number of rounds of each.
 BENCHMARKS = {
     "env": 9,
+    "train": 5,
     "update": 5,
     "resume": 50,
     "features": 9,

@@ -17,13 +17,14 @@ import torch
 from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequential
 from torch import Tensor, nn
 from torchrl.envs.utils import ExplorationType
-from torchrl.modules import MLP, IndependentNormal, ProbabilisticActor, ValueOperator
+from torchrl.modules import IndependentNormal, ProbabilisticActor, ValueOperator
 
 from egopose.core.config import from_mapping
 from egopose.core.errors import InputError
 from egopose.models.context import BidirectionalContext, ForwardContext
 from egopose.models.episode_context import EpisodeContext, episode_context_module
 from egopose.models.feedback import BalanceFeedback, FeedbackSettings
+from egopose.models.mixed_precision import MixedPrecisionMLP
 from egopose.models.recurrent import PastContext, past_context_module, state_memory
 
 _log = logging.getLogger(__name__)
@@ -272,8 +273,10 @@ def _width(widths: Mapping[str, int], key: str, setting: str) -> int:
     return int(widths[key])
 
 
-def _mlp(in_features: int, out_features: int, hidden: Sequence[int], activation: str) -> MLP:
-    return MLP(in_features, out_features, num_cells=list(hidden), activation_class=_ACTIVATIONS[activation])
+def _mlp(in_features: int, out_features: int, hidden: Sequence[int], activation: str) -> MixedPrecisionMLP:
+    return MixedPrecisionMLP(
+        in_features, out_features, num_cells=list(hidden), activation_class=_ACTIVATIONS[activation]
+    )
 
 
 def log_parameter_count(label: str, module: nn.Module) -> int:
