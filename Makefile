@@ -3,7 +3,8 @@ VENV ?= .venv
 export VENV
 PYTHON_BIN := $(VENV)/bin/python
 DEMO_ARGS ?=
-# One thread a process and no spinning: tests run beside each other, and OpenMP's busy waiting starves the physics.
+# One thread a process and no spinning: physics has threads of its own, and tests run beside each other.
+# OpenMP's busy waiting would starve the physics.
 THREADS := OMP_NUM_THREADS=1 OMP_WAIT_POLICY=PASSIVE GOMP_SPINCOUNT=0
 WORKERS ?= 2
 
@@ -17,7 +18,7 @@ venv: ## make the virtual environment and check headless GL
 	@scripts/setup.sh
 
 demo: venv ## show on one page what the pretrained weights make of a person they have not seen
-	$(PYTHON_BIN) -m egopose.demo $(DEMO_ARGS)
+	$(THREADS) $(PYTHON_BIN) -m egopose.demo $(DEMO_ARGS)
 
 train-demo: venv ## train a policy on the default data, evaluate it, show a table and a video
 	$(PYTHON_BIN) -m egopose.demo train=true $(DEMO_ARGS)
