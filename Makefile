@@ -3,12 +3,13 @@ VENV ?= .venv
 export VENV
 PYTHON_BIN := $(VENV)/bin/python
 DEMO_ARGS ?=
-# One thread a process and no spinning: tests run beside each other, and OpenMP's busy waiting starves the physics.
+# One thread a process and no spinning: physics has threads of its own, and tests run beside each other.
+# OpenMP's busy waiting would starve the physics.
 THREADS := OMP_NUM_THREADS=1 OMP_WAIT_POLICY=PASSIVE GOMP_SPINCOUNT=0
 WORKERS ?= 2
 
 .DEFAULT_GOAL := help
-.PHONY: help venv demo docs test test-slow lint format clean
+.PHONY: help venv demo train-demo docs test test-slow lint format clean
 
 help: ## list the targets
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -16,8 +17,11 @@ help: ## list the targets
 venv: ## make the virtual environment and check headless GL
 	@scripts/setup.sh
 
-demo: venv ## train a policy on the default data, evaluate it, show a table and a video
-	$(PYTHON_BIN) -m egopose.demo $(DEMO_ARGS)
+demo: venv ## show on one page what the pretrained weights make of a person they have not seen
+	$(THREADS) $(PYTHON_BIN) -m egopose.demo $(DEMO_ARGS)
+
+train-demo: venv ## train a policy on the default data, evaluate it, show a table and a video
+	$(PYTHON_BIN) -m egopose.demo train=true $(DEMO_ARGS)
 
 docs: venv ## build the docs as a site in outputs/site; a broken link ends it (the tests do this too)
 	NO_MKDOCS_2_WARNING=1 $(PYTHON_BIN) -m mkdocs build --strict

@@ -231,6 +231,7 @@ def test_commands_in_the_docs_name_verbs_that_are_there(path: Path) -> None:
         ("egopose bench st", {"stream"}),
         ("egopose bench stream --js", {"--json"}),
         ("egopose demo bu", {"budget="}),
+        ("egopose demo tr", {"train=", "training."}),
         ("egopose export t", {"to=", "take="}),
         ("egopose nothing x", set()),
     ],

@@ -40,7 +40,7 @@ compdef _egopose egopose
 SCRIPTS = {"bash": _BASH, "zsh": _ZSH}
 _PARSED = ("bench", "view")  # verbs with options in the manner of --port
 _CONFIG = {"bench": "train", "demo": "train"}  # verbs whose settings stand in another's file
-_MORE = {"demo": ("budget=",), "export": ("to=",)}  # words that stand in no file
+_MORE = {"demo": ("train=", "budget="), "export": ("to=",)}  # words that stand in no file
 
 
 def candidates(line: str, verbs: list[str]) -> list[str]:

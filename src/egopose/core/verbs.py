@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 VERBS = {
-    "demo": "train a policy on the default data, evaluate it, show a table and a video",
+    "demo": "show on one page what the pretrained weights make of an unseen person; train=true trains a policy",
     "prepare": "make a store of motion files and videos: retargeting, rendering, optical flow, features",
     "sync": "find the offset between a video and a motion by the turns of the head",
     "train": "train a policy, or the body-part estimator (Hydra: group=choice key=value, --multirun)",
