@@ -214,8 +214,9 @@ class TrajectoryOptimiser:
             added: ``[N, H, nu]`` of its controls from the feed-forward.
         """
         weights = torch.from_numpy(self.cost.weights(wrong.shape[-1] // 2)).float()
-        a_all, b_all = torch.from_numpy(state), torch.from_numpy(control)
-        error, extra = torch.from_numpy(wrong).float(), torch.from_numpy(added).float()
+        # A body that breaks within the horizon has no derivatives: its plan stays as it was.
+        a_all, b_all = torch.from_numpy(state).nan_to_num(0, 0, 0), torch.from_numpy(control).nan_to_num(0, 0, 0)
+        error, extra = torch.from_numpy(wrong).float().nan_to_num(0, 0, 0), torch.from_numpy(added).float()
         curvature = torch.diag(self.cost.last * weights).expand(len(a_all), -1, -1)
         slope = self.cost.last * weights * error[:, -1]
         changes: list[Tensor] = []
@@ -225,11 +226,9 @@ class TrajectoryOptimiser:
             a, b = a_all[:, t], b_all[:, t]
             forced, moved_on = curvature @ b, curvature @ a
             quu, qux = b.mT @ forced + self.cost.control * eye, b.mT @ moved_on
-            # Single precision: a hundred-thousandth of the largest entry keeps the matrix positive.
-            quu = quu + 1e-5 * quu.diagonal(dim1=-2, dim2=-1).amax(-1)[:, None, None] * eye
             qu = (b.mT @ slope[..., None])[..., 0] + self.cost.control * extra[:, t]
             qx = (a.mT @ slope[..., None])[..., 0] + weights * error[:, t]
-            solved = -torch.cholesky_solve(torch.cat([qux, qu[..., None]], dim=-1), torch.linalg.cholesky(quu))
+            solved = -torch.cholesky_solve(torch.cat([qux, qu[..., None]], dim=-1), _factor(quu))
             gain, change = solved[..., :-1], solved[..., -1]
             changes.append(change)
             gains.append(gain)
@@ -237,3 +236,19 @@ class TrajectoryOptimiser:
             curvature = 0.5 * (curvature + curvature.mT)
             slope = qx + (gain.mT @ qu[..., None])[..., 0]
         return torch.stack(changes[::-1], 1).double().numpy(), torch.stack(gains[::-1], 1).numpy()
+
+
+def _factor(matrices: Tensor) -> Tensor:
+    """Cholesky factors of ``matrices [N, n, n]``, with as much of their largest entry on the diagonal as they need.
+
+    In single precision a hundred-thousandth is enough, but where a body breaks.
+    """
+    eye = torch.eye(matrices.shape[-1])
+    largest = matrices.diagonal(dim1=-2, dim2=-1).abs().amax(-1)[:, None, None]
+    share = torch.full((len(matrices), 1, 1), 1e-5)
+    for _ in range(5):
+        factor, failed = torch.linalg.cholesky_ex(matrices + share * largest * eye)
+        if not failed.any():
+            break
+        share = torch.where(failed[:, None, None] > 0, 30.0 * share, share)
+    return factor

@@ -53,8 +53,8 @@ class Tracking(ImitationTask):
         """
         task = config["task"]
         errors = [
-            None if row is None else from_mapping(TargetError, row, f"task.errors.{name}")
-            for name, row in task["errors"].items()
+            None if row is None else from_mapping(TargetError, row, f"task.errors[{number}]")
+            for number, row in enumerate(task["errors"])
         ]
         motions = sources.motions()
         clips, train = clips_of(motions), list(motions.train)

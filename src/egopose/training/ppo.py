@@ -25,7 +25,6 @@ from egopose.core.errors import InputError
 from egopose.models.mixed_precision import bfloat16_layers, has_bfloat16_products
 from egopose.models.recurrent import is_recurrent
 
-
 AUTOCAST = ("auto", "bfloat16", "none")
 
 
