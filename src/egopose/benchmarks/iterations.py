@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any, NamedTuple
 
 import torch
@@ -54,7 +55,8 @@ class Iterations:
         clock.append(time.perf_counter())
         self.ppo.update(rows)
         clock.append(time.perf_counter())
-        return Parts(*(after - before for before, after in zip(clock, clock[1:], strict=False)), batch.numel())
+        collect, advantages, update = (after - before for before, after in pairwise(clock))
+        return Parts(collect, advantages, update, batch.numel())
 
     def gradient_steps(self, rows: int) -> int:
         """Of an iteration over so many rows."""

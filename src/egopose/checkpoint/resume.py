@@ -18,13 +18,14 @@ from egopose.core.former_names import upgraded
 from egopose.core.safe_io import read_json as read_json_file
 from egopose.core.safe_io import read_yaml
 
-#: What a resumed run may change: how long it goes on, what it keeps, where it is logged, on how many threads it runs.
+#: What a resumed run may change: how long it goes on, what it keeps, where it is logged, how it uses the processor.
 CHANGEABLE = (
     "training",
     "logger",
     "output",
     "resume",
     "algo.iterations",
+    "algo.autocast",
     "collector.physics_threads",
     "collector.threads",
     "collector.update_threads",

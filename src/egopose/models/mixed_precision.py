@@ -1,7 +1,7 @@
-"""MLPs with their hidden layers in bfloat16, for processors that multiply it several times as fast as float32.
+"""MLPs in bfloat16, for processors that multiply it several times as fast as float32.
 
-bfloat16 keeps float32's range and eight bits of its precision. Parameters, and what the last layer gives, stay float32:
-a mean action rounded to eight bits would move the ratio of probabilities that PPO clips.
+bfloat16 keeps float32's range and eight bits of its precision. Parameters stay float32, and so does all that reads what
+an MLP gives: distributions, losses.
 """
 
 from __future__ import annotations
@@ -15,36 +15,31 @@ import torch
 from torch import Tensor
 from torchrl.modules import MLP
 
-_HALVED: ContextVar[bool] = ContextVar("bfloat16_layers", default=False)
+_ACTIVE: ContextVar[bool] = ContextVar("bfloat16_products", default=False)
 
 
 def has_bfloat16_products() -> bool:
     """Whether this processor has instructions for products of bfloat16 (AVX512_BF16); False where torch cannot tell."""
-    # Not there before torch 2.10; on other processors than Intel's and AMD's without this entry.
-    capabilities: Callable[[], dict[str, Any]] = getattr(torch.cpu, "get_capabilities", dict)
+    capabilities: Callable[[], dict[str, Any]] = getattr(torch.cpu, "get_capabilities", dict)  # newer than torch 2.9
     return bool(capabilities().get("avx512_bf16", False))
 
 
 @contextmanager
-def bfloat16_layers(active: bool = True) -> Iterator[None]:
-    """Inside, every :class:`MixedPrecisionMLP` computes its hidden layers in bfloat16, and their gradients."""
-    token = _HALVED.set(active)
+def bfloat16_products(active: bool = True) -> Iterator[None]:
+    """Inside, every :class:`MixedPrecisionMLP` computes in bfloat16, its gradients too."""
+    token = _ACTIVE.set(active)
     try:
         yield
     finally:
-        _HALVED.reset(token)
+        _ACTIVE.reset(token)
 
 
 class MixedPrecisionMLP(MLP):
-    """TorchRL's MLP, which heeds :func:`bfloat16_layers`; its result is float32 all the same."""
+    """TorchRL's MLP, which heeds :func:`bfloat16_products`; what it gives is float32 all the same."""
 
     def forward(self, *inputs: Tensor) -> Tensor:
-        """``[..., d_i]``, put side by side -> ``[..., out_features]``."""
-        if not _HALVED.get():
+        """``[..., d_i]``, put side by side -> ``[..., out_features]`` float32."""
+        if not _ACTIVE.get():
             return super().forward(*inputs)
-        *layers, last = self
         with torch.autocast("cpu", torch.bfloat16):
-            hidden = torch.cat([part.to(torch.bfloat16) for part in inputs], dim=-1)
-            for layer in layers:
-                hidden = layer(hidden)
-        return last(hidden.float())
+            return super().forward(torch.cat([part.to(torch.bfloat16) for part in inputs], dim=-1)).float()
