@@ -39,6 +39,7 @@ SETTINGS: dict[str, Any] = {
 LOOP: dict[str, Any] = {
     "iterations": 6,
     "steps_per_iteration": 256,
+    "critic_first": 0,
     "total_steps": None,
     "max_seconds": None,
     "checkpoint_every": 3,
