@@ -54,7 +54,7 @@ def test_a_body_on_a_target_that_stands_sees_zeros() -> None:
 
 
 def test_the_numbers_are_those_by_hand() -> None:
-    """A body at (1, 2) faces along y; the target's root is 0.3 m ahead of it, 0.15 m to its left, turned by -0.1 rad."""
+    """A body at (1, 2) faces along y; the target's root is 0.3 m ahead of it, 0.15 m to its left, turned by -0.1."""
     state, target = np.zeros((1, LAYOUT.size)), np.zeros((1, 1, LAYOUT.size))
     state[0, 0], target[0, 0, 0] = 0.9, 0.95
     state[0, 1] = target[0, 0, 1] = 1.0

@@ -229,7 +229,11 @@ class TrajectoryOptimiser:
             quu = quu + 1e-5 * quu.diagonal(dim1=-2, dim2=-1).amax(-1)[:, None, None] * eye
             qu = (b.mT @ slope[..., None])[..., 0] + self.cost.control * extra[:, t]
             qx = (a.mT @ slope[..., None])[..., 0] + weights * error[:, t]
-            solved = -torch.cholesky_solve(torch.cat([qux, qu[..., None]], dim=-1), torch.linalg.cholesky(quu))
+            lower, failed = torch.linalg.cholesky_ex(quu)
+            solved = -torch.cholesky_solve(torch.cat([qux, qu[..., None]], dim=-1), lower)
+            # A step that broke has derivatives beyond all numbers: that body's controls stay, the others' do not mind.
+            sound = (failed == 0) & solved.isfinite().all(-1).all(-1)
+            solved = torch.where(sound[:, None, None], solved, 0.0)
             gain, change = solved[..., :-1], solved[..., -1]
             changes.append(change)
             gains.append(gain)

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import os
 import sys
+import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
+from zipfile import BadZipFile
 
 import numpy as np
 import torch
@@ -93,8 +95,11 @@ def train_tracker(values: Mapping[str, Any]) -> None:
     with only_process(out):
         teaching = _prepared(values)
         try:
+            lessons: list[Lessons] = []
             for number in range(int(values["rounds"])):
-                _round(teaching, number)
+                # Of the policy as the round before left it, so that lessons that went missing are made as they were.
+                lessons.append(_lessons(teaching, number))
+                _round(teaching, number, lessons)
             print(f"policy: {teaching.weights(int(values['rounds']) - 1)}", flush=True)
         finally:
             teaching.run.collector.shutdown()
@@ -108,6 +113,12 @@ def _prepared(values: Mapping[str, Any]) -> _Teaching:
     cloning = from_mapping(CloningSettings, values["cloning"], f"{_SOURCE}: cloning")
     config = absolute_paths({key: value for key, value in values.items() if key not in (*_OWN, "experiment")})
     config["seed"] = values["seed"]
+    if settings.every > settings.horizon:
+        raise InputError(
+            _SOURCE, "teacher.every", f"is {settings.every}: plans reach {settings.horizon} frames ahead (horizon)"
+        )
+    if config["training"]["start_from"] is not None:
+        raise InputError(_SOURCE, "training.start_from", "is for PPO: a taught policy begins with its lessons")
     if config["task"]["name"] != "tracking":
         raise InputError(_SOURCE, "task", f"a teacher follows motion: task=tracking, not {config['task']['name']!r}")
     dataset = load_dataset(config)
@@ -120,14 +131,12 @@ def _prepared(values: Mapping[str, Any]) -> _Teaching:
     )
 
 
-def _round(teaching: _Teaching, number: int) -> None:
-    """Lessons of a round, and what the policy learns from those of all rounds so far."""
-    lessons = [_lessons(teaching, earlier) for earlier in range(number)]
+def _round(teaching: _Teaching, number: int, lessons: list[Lessons]) -> None:
+    """What the policy learns from the lessons of all rounds so far."""
     weights = teaching.weights(number)
     if weights.is_dir():
         teaching.checkpoint().restore(weights)
         return
-    lessons.append(_lessons(teaching, number))
     whole = Lessons.joined(lessons)
     dataset, task = teaching.dataset, teaching.run.config["task"]
     assert dataset.states is not None
@@ -177,6 +186,8 @@ def _lessons(teaching: _Teaching, number: int) -> Lessons:
     folder.mkdir(parents=True, exist_ok=True)
     own = [Piece(f.take, f.start, f.stop) for f in dataset.train if f.take < teaching.clips]
     pieces = chunks(own, dataset.takes.offsets.tolist(), teaching.teacher.chunk)
+    if not pieces:
+        raise InputError("configuration", "data", "no take has two frames to train on, so there is nothing to teach")
     order = np.random.default_rng([int(values["seed"]), number]).permutation(len(pieces))
     shards = np.array_split(order, max(1, len(pieces) // int(values["shard"])))
     files = [folder / f"{index:04d}.npz" for index in range(len(shards))]
@@ -197,16 +208,26 @@ def _lessons(teaching: _Teaching, number: int) -> Lessons:
             told = f"round {number}, lessons {index + 1} of {len(files)}: {len(lessons)}, bodies lost {lost}"
             print(told, file=sys.stderr, flush=True)
         simulator.close()
-    return Lessons.joined([_read(file) for file in files])
+    model = dataset.humanoid.mj_model
+    return Lessons.joined([_read(file, model.nq, model.nv, model.nu, dataset.reference.shape[0]) for file in files])
 
 
-def _read(path: Path) -> Lessons:
-    """Raises InputError: the file is no lessons."""
+def _read(path: Path, nq: int, nv: int, nu: int, frames: int) -> Lessons:
+    """Raises InputError: the file is no lessons, or those of another body or motion."""
+    remedy = "remove it and give the command again"
     try:
         with np.load(path, allow_pickle=False) as arrays:
-            return Lessons(**{f.name: arrays[f.name] for f in fields(Lessons)})
-    except (OSError, ValueError, KeyError) as error:
-        raise InputError(path, "lessons", f"is damaged: {error}; remove it and give the command again") from None
+            lessons = Lessons(**{f.name: arrays[f.name] for f in fields(Lessons)})
+    except (OSError, ValueError, KeyError, EOFError, BadZipFile, zlib.error) as error:
+        raise InputError(path, "lessons", f"is damaged: {error}; {remedy}") from None
+    shapes = {"frame": (), "qpos": (nq,), "qvel": (nv,), "ctrl": (nu,), "gains": (nu, 2 * nv)}
+    for name, shape in shapes.items():
+        found = getattr(lessons, name).shape
+        if found != (len(lessons), *shape):
+            raise InputError(path, name, f"has shape {list(found)}, not {[len(lessons), *shape]}; {remedy}")
+    if len(lessons) and not 0 <= lessons.frame.min() <= lessons.frame.max() < frames:
+        raise InputError(path, "frame", f"is of a motion of more than {frames} frames; {remedy}")
+    return lessons
 
 
 def _set_statistics(teaching: _Teaching, reader: LessonReader) -> None:

@@ -52,10 +52,11 @@ class TargetError:
 
 def smooth_noise(rng: np.random.Generator, frames: int, columns: int, deviation: float) -> Array:
     """``[frames, columns]`` noise of unit variance, correlated over ``deviation`` frames."""
-    reach = int(4 * deviation) + 1
-    noise = gaussian_filter1d(rng.normal(size=(frames + 2 * reach, columns)), deviation, axis=0)[reach:-reach]
-    # A Gaussian filter leaves 1 / (2 sqrt(pi) sigma) of white noise's variance.
-    return noise * np.sqrt(2.0 * np.sqrt(np.pi) * max(deviation, 0.3))
+    sigma = max(deviation, 0.01)  # white noise, which SciPy's filter refuses to give
+    reach = int(4 * sigma) + 1
+    noise = gaussian_filter1d(rng.normal(size=(frames + 2 * reach, columns)), sigma, axis=0)[reach:-reach]
+    kernel = gaussian_filter1d(np.eye(1, 2 * reach + 1, reach)[0], sigma)
+    return np.asarray(noise / np.sqrt((kernel**2).sum()))
 
 
 def with_error(qpos: Array, fps: float, joint_range: Array, error: TargetError, rng: np.random.Generator) -> Array:

@@ -31,9 +31,12 @@ class Tracking(ImitationTask):
     name, protocol = "tracking", "survival"
 
     def check(self, config: Mapping[str, Any]) -> None:
-        """Raises InputError: the policy cannot see what it should follow."""
+        """Raises InputError: the policy cannot see what it should follow, or it is never, or not first, the truth."""
         if WINDOW not in config["model"]["inputs"]:
             raise InputError("configuration", "model.inputs", f"a tracker follows {WINDOW}: model=tracking")
+        free = [name for name, row in config["task"]["errors"].items() if row is None]
+        if free != list(config["task"]["errors"])[:1]:
+            raise InputError("configuration", "task.errors", f"needs the truth (null) first and once, not as {free}")
 
     def dataset(self, config: Mapping[str, Any], sources: Sources) -> Dataset:
         """Every training clip with each error of ``task.errors``, and its mirror image; test clips without errors.

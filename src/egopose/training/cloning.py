@@ -145,7 +145,7 @@ def clone(
     settings: CloningSettings,
     progress: Callable[[int, float, float], None],
 ) -> float:
-    """Teach ``network(state, window) -> action``; the last mean squared error, rad^2.
+    """Teach ``network(state, window) -> action``; the mean squared error of the last steps, rad^2.
 
     Args:
         network: the policy's mean.
@@ -169,7 +169,8 @@ def clone(
         if step % _TOLD_EVERY == 0:
             error, total = total / _TOLD_EVERY, 0.0
             progress(step, error**0.5, time.monotonic() - began)
-    return error
+    left = step % _TOLD_EVERY
+    return total / left if left else error
 
 
 _WARM_UP, _TOLD_EVERY = 200, 500  # steps
