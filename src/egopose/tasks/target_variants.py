@@ -130,7 +130,9 @@ def target_variants(
         seed: of the errors.
     """
     rng, fps = np.random.default_rng(seed), 1.0 / humanoid.control_dt
-    references, states, targets, paths, lengths, lowest = [], [], [], [], [], []
+    references, states, targets, paths = [], [], [], []
+    lengths: list[int] = []
+    lowest: list[float] = []
     pieces: list[Piece] = []
     first: list[Piece] = []
     for side in range(1 + mirror):
