@@ -46,6 +46,8 @@ LOOP: dict[str, Any] = {
     "keep_last": 2,
     "evaluate_every": 0,
 }
+#: Those of them that stand in the group ``algo``.
+LOOP_IN_ALGO = ("iterations", "steps_per_iteration", "critic_first")
 COLLECTOR: dict[str, Any] = {
     "kind": "sync",
     "num_envs": 8,

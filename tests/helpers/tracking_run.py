@@ -11,7 +11,7 @@ from egopose.tasks.dataset import Dataset
 from egopose.tasks.tracking import TASK
 from helpers.env_stand_in import group
 from helpers.humanoid_stand_in import reference_motion, stand_in
-from helpers.toy_problem import COLLECTOR, LOOP, SETTINGS
+from helpers.toy_problem import COLLECTOR, LOOP, LOOP_IN_ALGO, SETTINGS
 
 ALSO = (Piece(0, 0, 30),)
 TRAIN, TEST = (Piece(0, 0, 40), Piece(1, 0, 12)), (Piece(1, 12, 25),)
@@ -38,7 +38,7 @@ class StandInSources:
 
 def configuration(folder: str | None = None, **training: Any) -> dict[str, Any]:
     loop = {**LOOP, "steps_per_iteration": 48, "iterations": 4, "checkpoint_every": 2, **training}
-    own = {key: loop.pop(key) for key in ("iterations", "steps_per_iteration", "critic_first")}
+    own = {key: loop.pop(key) for key in LOOP_IN_ALGO}
     model = group("model", "tracking")
     return {
         "seed": 5,

@@ -30,7 +30,7 @@ from egopose.motion.rotations import Array
 
 @dataclass(frozen=True)
 class TargetError:
-    """How far what is followed is from the truth. Standard deviations of smooth noise, in time and over takes.
+    """How far the target motion is from the truth. Standard deviations of smooth noise, in time and over takes.
 
     Args:
         joints: rad, of every joint angle.
@@ -90,7 +90,7 @@ def mirrored(humanoid: HumanoidModel, qpos: Array) -> Array:
 
 @dataclass(frozen=True)
 class Variants:
-    """Takes with what is followed beside what is true, one after the other.
+    """Takes with the target motion beside the true one, one after the other.
 
     Args:
         reference: body states ``[F]``.
@@ -125,7 +125,7 @@ def target_variants(
         humanoid: whose motion it is.
         clips: ``qpos [T, nq]`` at the control rate.
         fragments: of the clips.
-        errors: of what is followed.
+        errors: of the target motion.
         mirror: whether mirror images are added.
         seed: of the errors.
     """

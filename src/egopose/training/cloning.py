@@ -1,6 +1,6 @@
 """A tracker learns what its teacher would do (:mod:`egopose.training.teacher`), before PPO takes over.
 
-Each lesson is seen many times: with other errors in what is followed, mirrored, and in states near its own, where the
+Each lesson is seen many times: with other errors in the target motion, mirrored, and in states near its own, where the
 teacher's gains tell the control. So the gains are targets for the policy's derivative.
 """
 
@@ -32,7 +32,7 @@ class CloningSettings:
         seconds: of learning, a round.
         batch: lessons a step.
         learning_rate, weight_decay: AdamW, with a linear warm-up and a fall to nothing.
-        truth: share of the lessons in which what is followed has no error.
+        truth: share of the lessons in which the target motion has no error.
         nearby: share of the lessons that are moved.
         place, turn, joints: m, rad and rad, standard deviations of the largest moves.
         linear, angular, joint_rates: m/s, rad/s and rad/s, likewise.
