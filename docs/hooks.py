@@ -23,18 +23,18 @@ NOTEBOOK = "notebooks/first_look.ipynb"
 #: Rooms of the package and the modules of each whose public names others build on.
 API = {
     "motion": "motion rotations skeleton kinematics mapping retarget contacts ground io",
-    "humanoid": "config model from_motion physics boxes state_layout",
+    "humanoid": "config model from_motion physics boxes derivatives trajectory state_layout",
     "vision": "video flow lens head_signal head_film camera_rotation features encoders rendering rooms takes "
     "body_parts body_part_pictures",
     "data": "take_sources preparation prepare_motion sync_offset store splits feasibility gate",
     "models": "policy context episode_context regressor pose_regression predictions mirror",
-    "envs": "imitation problem env dm_control_task starts transforms "
-    "mdp.observations mdp.rewards mdp.step_view mdp.terminations",
+    "envs": "imitation tracking problem env dm_control_task starts transforms target_window "
+    "mdp.observations mdp.path mdp.rewards mdp.step_view mdp.terminations",
     "tasks": "task dataset",
     "collection": "collectors",
     "checkpoint": "checkpoint pretrained body_parts",
-    "training": "loop ppo regressor body_parts survival",
-    "pipeline": "agent dataset environment run",
+    "training": "loop ppo regressor teacher cloning body_parts survival",
+    "pipeline": "agent dataset environment run tracker",
     "inference": "estimator failsafe forecaster planner bands",
     "evaluation": "metrics position_metrics protocols statistics agents",
 }

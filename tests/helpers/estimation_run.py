@@ -10,7 +10,7 @@ from egopose.envs.mdp.observations import humanoid_state
 from egopose.tasks.dataset import Dataset
 from helpers.env_stand_in import PIECES, group
 from helpers.humanoid_stand_in import reference_motion, stand_in
-from helpers.toy_problem import COLLECTOR, LOOP, SETTINGS
+from helpers.toy_problem import COLLECTOR, LOOP, LOOP_IN_ALGO, SETTINGS
 
 
 def estimation_dataset() -> Dataset:
@@ -49,7 +49,11 @@ def configuration(context: str = "frozen", **training: Any) -> dict[str, Any]:
             "feedback": {**model["feedback"], **FEEDBACK},
             "context": {**model["context"], "source": context, "hidden_size": 4},
         },
-        "algo": {**SETTINGS, "minibatch_size": 16, **{k: loop.pop(k) for k in ("iterations", "steps_per_iteration")}},
+        "algo": {
+            **SETTINGS,
+            "minibatch_size": 16,
+            **{k: loop.pop(k) for k in LOOP_IN_ALGO},
+        },
         "collector": {**COLLECTOR, "num_envs": 4},
         "training": {**loop, "evaluation_num_envs": 2, "evaluation_seed": 1},
     }

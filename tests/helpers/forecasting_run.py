@@ -9,7 +9,7 @@ import torch
 from egopose.tasks.dataset import Dataset
 from helpers.env_stand_in import PIECES, group
 from helpers.humanoid_stand_in import reference_motion, stand_in
-from helpers.toy_problem import COLLECTOR, LOOP, SETTINGS
+from helpers.toy_problem import COLLECTOR, LOOP, LOOP_IN_ALGO, SETTINGS
 
 CONTEXT, HORIZON = 5, 8
 
@@ -35,7 +35,11 @@ def configuration(**training: Any) -> dict[str, Any]:
             "context": {**model["context"], "hidden_size": 4, "horizon": CONTEXT},
             "memory": {"hidden_size": 7},
         },
-        "algo": {**SETTINGS, "minibatch_size": 40, **{k: loop.pop(k) for k in ("iterations", "steps_per_iteration")}},
+        "algo": {
+            **SETTINGS,
+            "minibatch_size": 40,
+            **{k: loop.pop(k) for k in LOOP_IN_ALGO},
+        },
         "collector": {**COLLECTOR, "num_envs": 4},
         "training": {**loop, "evaluation_num_envs": 2, "evaluation_seed": 1},
     }

@@ -39,12 +39,15 @@ SETTINGS: dict[str, Any] = {
 LOOP: dict[str, Any] = {
     "iterations": 6,
     "steps_per_iteration": 256,
+    "critic_first": 0,
     "total_steps": None,
     "max_seconds": None,
     "checkpoint_every": 3,
     "keep_last": 2,
     "evaluate_every": 0,
 }
+#: Those of them that stand in the group ``algo``.
+LOOP_IN_ALGO = ("iterations", "steps_per_iteration", "critic_first")
 COLLECTOR: dict[str, Any] = {
     "kind": "sync",
     "num_envs": 8,

@@ -21,7 +21,7 @@ from egopose.pipeline.run import build_run
 from egopose.training.regressor import build_regressor
 from egopose.vision.encoders import build_encoder
 from helpers.env_stand_in import group
-from helpers.toy_problem import COLLECTOR, LOOP, SETTINGS
+from helpers.toy_problem import COLLECTOR, LOOP, LOOP_IN_ALGO, SETTINGS
 
 FRAMES = 20
 
@@ -51,7 +51,7 @@ def make_run(folder: Path, cross_fit: int = 1) -> Path:
         "model": {**group("model", "fast"), "hidden": [8]},
         "collector": {**COLLECTOR, "num_envs": 2},
         "algo": {**SETTINGS, "iterations": 1, "steps_per_iteration": 16},
-        "training": {k: v for k, v in LOOP.items() if k not in ("iterations", "steps_per_iteration")},
+        "training": {k: v for k, v in LOOP.items() if k not in LOOP_IN_ALGO},
     }
     torch.manual_seed(0)
     humanoid = build_humanoid(HumanoidConfig.from_mapping(config["humanoid"]), SimConfig(substeps=5))

@@ -39,7 +39,7 @@ def test_algo_files_fill_the_settings(algo: str, gamma: float) -> None:
     assert (settings.gamma, settings.lmbda, settings.clip_epsilon) == (gamma, 0.95, 0.2)
 
 
-LOOP_KEYS = ("iterations", "steps_per_iteration")
+LOOP_KEYS = ("iterations", "steps_per_iteration", "critic_first")
 
 
 def test_the_papers_numbers() -> None:

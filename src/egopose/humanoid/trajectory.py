@@ -210,7 +210,7 @@ class TrajectoryOptimiser:
 
         Args:
             state, control: A ``[N, H, 2 nv, 2 nv]`` and B ``[N, H, 2 nv, nu]`` along the nominal.
-            wrong: ``[N, H + 1, 2 nv]`` differences of the nominal from what is followed.
+            wrong: ``[N, H + 1, 2 nv]`` differences of the nominal from the target motion.
             added: ``[N, H, nu]`` of its controls from the feed-forward.
         """
         weights = torch.from_numpy(self.cost.weights(wrong.shape[-1] // 2)).float()

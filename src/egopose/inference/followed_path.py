@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from egopose.envs.mdp import rotations as rot
+from egopose.envs.mdp.path import turned
 
 
 class FollowedPath:
@@ -42,14 +43,14 @@ class FollowedPath:
         The first call lays the path where the bodies stand.
         """
         body, facing = qpos[:, :2], rot.yaw(qpos[:, 3:7])
-        near, turned = self._shares
+        near, nearer = self._shares
         if self._turn is None:
             self._turn, self._shift = torch.zeros_like(facing), torch.zeros_like(body)
-            near, turned = 1.0, 1.0
+            near, nearer = 1.0, 1.0
         place, heading = self.at(row)
-        self._turn = self._turn + turned * rot.wrapped(facing - heading)
+        self._turn = self._turn + nearer * rot.wrapped(facing - heading)
         place = torch.lerp(place, body, near)
-        self._shift = place - _turned(self._places.index_select(0, row), self._turn)
+        self._shift = place - turned(self._places.index_select(0, row), self._turn)
 
     def at(self, row: Tensor, bodies: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """Place ``[n, 2]`` m and heading ``[n]`` rad that are followed at ``row [n]``, each in the world of its body.
@@ -66,11 +67,4 @@ class FollowedPath:
         copies = len(row) // len(self._turn)
         turn = self._turn.repeat(copies) if bodies is None else self._turn[bodies]
         shift = self._shift.repeat(copies, 1) if bodies is None else self._shift[bodies]
-        return _turned(self._places.index_select(0, row), turn) + shift, self._headings.index_select(0, row) + turn
-
-
-def _turned(places: Tensor, angle: Tensor) -> Tensor:
-    """``places [n, 2]`` turned about the origin by ``angle [n]`` rad."""
-    cos, sin = angle.cos(), angle.sin()
-    x, y = places.unbind(-1)
-    return torch.stack([cos * x - sin * y, sin * x + cos * y], dim=-1)
+        return turned(self._places.index_select(0, row), turn) + shift, self._headings.index_select(0, row) + turn

@@ -10,6 +10,7 @@ from typing import Any
 import torch
 from tensordict import TensorDictBase
 
+from egopose.checkpoint.pretrained import is_pretrained
 from egopose.core.config import compose_config
 from egopose.data.preparation import fingerprint_of, flow_name, humanoid_of, prepare
 from egopose.data.splits import WHOLE, split_takes
@@ -132,7 +133,7 @@ def _motion_of(config: Mapping[str, Any], store: TakeStore) -> Dataset:
 
 
 def absolute_paths(config: dict[str, Any]) -> dict[str, Any]:
-    """The configuration with the files of ``data`` named from the root, so that a run can be resumed from anywhere."""
+    """The configuration with its files named from the root, so that a run can be resumed from anywhere."""
     data = dict(config["data"])
     for key in ("folder", "store"):
         if data.get(key):
@@ -142,7 +143,14 @@ def absolute_paths(config: dict[str, Any]) -> dict[str, Any]:
             {key: _absolute(value) if key in ("motion", "video") and value else value for key, value in take.items()}
             for take in data["takes"]
         ]
-    return {**config, "data": data}
+    out = {**config, "data": data}
+    if also := config.get("task", {}).get("also"):
+        sets = {name: {**row, "folder": row["folder"] and _absolute(row["folder"])} for name, row in also.items()}
+        out["task"] = {**config["task"], "also": sets}
+    start = config.get("training", {}).get("start_from")
+    if start is not None and not is_pretrained(start):
+        out["training"] = {**config["training"], "start_from": _absolute(start)}
+    return out
 
 
 def _absolute(path: str) -> str:

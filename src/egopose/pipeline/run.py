@@ -17,20 +17,8 @@ import torch
 from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import TransformedEnv
 
-from egopose.checkpoint.checkpoint import (
-    ComponentState,
-    RunCheckpoint,
-    find_checkpoint,
-    has_component,
-    require,
-    verify,
-)
-from egopose.collection.collectors import (
-    CollectorSettings,
-    build_collector,
-    load_transform_state,
-    transform_state,
-)
+from egopose.checkpoint.checkpoint import find_checkpoint, has_component, require, verify
+from egopose.collection.collectors import CollectorSettings, build_collector, transform_state
 from egopose.core.errors import InputError
 from egopose.core.runtime import settle_heap
 from egopose.envs.mdp.observations import humanoid_state
@@ -80,27 +68,25 @@ def build_run(config: Mapping[str, Any], folder: Path, dataset: Dataset) -> Run:
         ppo: PPO = _adversarial(config, dataset, actor, critic, ppo_settings)
     else:
         ppo = PPO(actor, critic, ppo_settings)
-    if training.get("start_from") is not None:
-        _start_from(str(training["start_from"]), ppo, collector, action_size)
     settle_heap()
     return Run(ppo, collector, settings, collector_settings, folder, config, action_size)
 
 
-def _start_from(path: str, ppo: PPO, collector: Any, action_size: int) -> None:
-    """Begin with the policy, the normaliser and, where there is one, the critic of another run.
+def start_from(run: Run, path: str) -> None:
+    """Begin with the policy, the normaliser and, where there is one, the critic of another run; not its optimisers.
+
+    Args:
+        run: not yet begun.
+        path: a run directory, whose latest checkpoint is taken, or a checkpoint.
 
     Raises:
         InputError: there is no such run, or its networks are of another shape.
     """
     folder = find_checkpoint(path, "latest")
-    require(verify(folder), folder, action_size=action_size)
-    saved: dict[str, Any] = {}
-    parts: dict[str, Any] = {"policy": ppo.actor, "transforms": ComponentState(dict, saved.update)}
-    if has_component(folder, "critic"):
-        parts["critic"] = ppo.critic
-    RunCheckpoint(parts).restore(folder, set(parts))
-    load_transform_state(collector, saved)
-    collector.update_policy_weights_()
+    require(verify(folder), folder, action_size=run.action_size)
+    critic = {"critic"} if has_component(folder, "critic") else set()
+    run.checkpoint().restore(folder, {"policy", "transforms"} | critic)
+    run.collector.update_policy_weights_()
 
 
 def _adversarial(

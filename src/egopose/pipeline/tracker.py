@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import sys
 from collections.abc import Mapping
@@ -15,10 +16,12 @@ from numpy.typing import NDArray
 from torch import nn
 
 from egopose.checkpoint.checkpoint import NOT_JUDGED, ComponentState, RunCheckpoint, metadata_of
-from egopose.checkpoint.resume import only_process
+from egopose.checkpoint.resume import differences, only_process
 from egopose.collection.collectors import transform_state
+from egopose.core.atomic_write import write_text_whole
 from egopose.core.config import from_mapping
 from egopose.core.errors import InputError
+from egopose.core.safe_io import read_json
 from egopose.core.torch_settings import torch_threads
 from egopose.envs.imitation import ImitationProblem
 from egopose.envs.starts import Piece
@@ -27,6 +30,7 @@ from egopose.humanoid.derivatives import Simulator
 from egopose.humanoid.inverse_dynamics import ForceSettings
 from egopose.humanoid.trajectory import TrackingCost
 from egopose.models.policy import GaussianHead
+from egopose.motion.io._npz import read_arrays
 from egopose.motion.rotations import Array
 from egopose.pipeline.dataset import absolute_paths, load_dataset
 from egopose.pipeline.environment import build_env
@@ -41,6 +45,7 @@ from egopose.training.teacher import Lessons, Student, TeacherSettings, chunks, 
 _SOURCE = "conf/tracker.yaml"
 _OWN = ("out", "rounds", "shard", "seed", "teacher", "cloning")
 _SIMULATED = 1024  # worlds of the teacher's simulator
+_MAX_BYTES = 2**30  # of a file of lessons: eight times what conf/tracker.yaml makes
 
 
 @dataclass(frozen=True)
@@ -93,8 +98,11 @@ def train_tracker(values: Mapping[str, Any]) -> None:
     with only_process(out):
         teaching = _prepared(values)
         try:
+            lessons: list[Lessons] = []
             for number in range(int(values["rounds"])):
-                _round(teaching, number)
+                # Of the policy as the round before left it, so that lessons that went missing are made as they were.
+                lessons.append(_lessons(teaching, number))
+                _round(teaching, number, lessons)
             print(f"policy: {teaching.weights(int(values['rounds']) - 1)}", flush=True)
         finally:
             teaching.run.collector.shutdown()
@@ -108,8 +116,15 @@ def _prepared(values: Mapping[str, Any]) -> _Teaching:
     cloning = from_mapping(CloningSettings, values["cloning"], f"{_SOURCE}: cloning")
     config = absolute_paths({key: value for key, value in values.items() if key not in (*_OWN, "experiment")})
     config["seed"] = values["seed"]
+    if settings.every > settings.horizon:
+        raise InputError(
+            _SOURCE, "teacher.every", f"is {settings.every}: plans reach {settings.horizon} frames ahead (horizon)"
+        )
+    if config["training"]["start_from"] is not None:
+        raise InputError(_SOURCE, "training.start_from", "is for PPO: a taught policy begins with its lessons")
     if config["task"]["name"] != "tracking":
         raise InputError(_SOURCE, "task", f"a teacher follows motion: task=tracking, not {config['task']['name']!r}")
+    _keep_settings(Path(str(values["out"])).expanduser(), {**config, "teacher": values["teacher"]}, values["shard"])
     dataset = load_dataset(config)
     run = build_run(config, Path(str(values["out"])).expanduser() / "policy", dataset)
     problem = run.collector.env.base_env.problem
@@ -120,14 +135,29 @@ def _prepared(values: Mapping[str, Any]) -> _Teaching:
     )
 
 
-def _round(teaching: _Teaching, number: int) -> None:
-    """Lessons of a round, and what the policy learns from those of all rounds so far."""
-    lessons = [_lessons(teaching, earlier) for earlier in range(number)]
+def _keep_settings(out: Path, config: Mapping[str, Any], shard: int) -> None:
+    """Note in ``out/settings.json`` what the lessons depend on.
+
+    Raises:
+        InputError: the folder holds lessons of other settings.
+    """
+    settings = {name: config[name] for name in ("data", "humanoid", "sim", "task", "teacher", "seed")} | {
+        "shard": shard
+    }
+    path = out / "settings.json"
+    if not path.is_file():
+        write_text_whole(path, json.dumps(settings, indent=1))
+        return
+    for field, before, now in differences(read_json(path, "settings"), json.loads(json.dumps(settings))):
+        raise InputError(path, field, f"is {before!r} in this folder's lessons, not {now!r}: give another out=FOLDER")
+
+
+def _round(teaching: _Teaching, number: int, lessons: list[Lessons]) -> None:
+    """What the policy learns from the lessons of all rounds so far."""
     weights = teaching.weights(number)
     if weights.is_dir():
         teaching.checkpoint().restore(weights)
         return
-    lessons.append(_lessons(teaching, number))
     whole = Lessons.joined(lessons)
     dataset, task = teaching.dataset, teaching.run.config["task"]
     assert dataset.states is not None
@@ -177,6 +207,8 @@ def _lessons(teaching: _Teaching, number: int) -> Lessons:
     folder.mkdir(parents=True, exist_ok=True)
     own = [Piece(f.take, f.start, f.stop) for f in dataset.train if f.take < teaching.clips]
     pieces = chunks(own, dataset.takes.offsets.tolist(), teaching.teacher.chunk)
+    if not pieces:
+        raise InputError("configuration", "data", "no take has two frames to train on, so there is nothing to teach")
     order = np.random.default_rng([int(values["seed"]), number]).permutation(len(pieces))
     shards = np.array_split(order, max(1, len(pieces) // int(values["shard"])))
     files = [folder / f"{index:04d}.npz" for index in range(len(shards))]
@@ -197,16 +229,29 @@ def _lessons(teaching: _Teaching, number: int) -> Lessons:
             told = f"round {number}, lessons {index + 1} of {len(files)}: {len(lessons)}, bodies lost {lost}"
             print(told, file=sys.stderr, flush=True)
         simulator.close()
-    return Lessons.joined([_read(file) for file in files])
+    model = dataset.humanoid.mj_model
+    return Lessons.joined([_read(file, model.nq, model.nv, model.nu, dataset.reference.shape[0]) for file in files])
 
 
-def _read(path: Path) -> Lessons:
-    """Raises InputError: the file is no lessons."""
+def _read(path: Path, nq: int, nv: int, nu: int, frames: int) -> Lessons:
+    """Raises InputError: the file is no lessons, or those of another body or motion."""
+    remedy = "remove it and give the command again"
+    names = [f.name for f in fields(Lessons)]
     try:
-        with np.load(path, allow_pickle=False) as arrays:
-            return Lessons(**{f.name: arrays[f.name] for f in fields(Lessons)})
-    except (OSError, ValueError, KeyError) as error:
-        raise InputError(path, "lessons", f"is damaged: {error}; remove it and give the command again") from None
+        arrays = read_arrays(path, names, _MAX_BYTES, _MAX_BYTES // 2)
+    except InputError as error:
+        raise InputError(path, error.field, f"{error.cause}; {remedy}") from None
+    if missing := [name for name in names if name not in arrays]:
+        raise InputError(path, missing[0], f"is missing; {remedy}")
+    count = len(arrays["frame"])
+    shapes = {"frame": (), "qpos": (nq,), "qvel": (nv,), "ctrl": (nu,), "gains": (nu, 2 * nv)}
+    for name, shape in shapes.items():
+        if arrays[name].shape != (count, *shape):
+            raise InputError(path, name, f"has shape {list(arrays[name].shape)}, not {[count, *shape]}; {remedy}")
+    frame = arrays["frame"]
+    if frame.dtype != np.int64 or (count and not 0 <= frame.min() <= frame.max() < frames):
+        raise InputError(path, "frame", f"holds no frames of these {frames}; {remedy}")
+    return Lessons(**arrays)
 
 
 def _set_statistics(teaching: _Teaching, reader: LessonReader) -> None:
@@ -225,7 +270,7 @@ def _student(teaching: _Teaching) -> Student:
     assert dataset.path is not None
     states, path, last = dataset.states, dataset.path, dataset.takes.last()
     ahead = tuple(int(frames) for frames in task["ahead"])
-    # Sees what is followed as it is, in the first copies.
+    # Sees the true motion, in the first copies.
     reader = LessonReader(
         None,
         problem,

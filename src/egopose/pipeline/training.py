@@ -9,7 +9,7 @@ from egopose.checkpoint.resume import FINISHED, continued_job, finished, mark_fi
 from egopose.core.errors import InputError
 from egopose.pipeline.dataset import absolute_paths, load_dataset, run_dataset
 from egopose.pipeline.forecaster import with_forecasts
-from egopose.pipeline.run import build_evaluation, build_run
+from egopose.pipeline.run import build_evaluation, build_run, start_from
 from egopose.tasks.dataset import Dataset
 from egopose.training.logging import build_loggers, write_provenance
 from egopose.training.loop import TrainingStopped, train
@@ -51,6 +51,8 @@ def run_training(
             if checkpoint is not None:
                 run.restore(checkpoint)
                 print(f"resuming {folder} after iteration {run.counters.iteration}", flush=True)
+            elif (other := config["training"].get("start_from")) is not None:
+                start_from(run, str(other))
             loggers = build_loggers(config["logger"], folder, config, run.counters.iteration, run.counters.frames)
             outcome = train(run, loggers, build_evaluation(run, dataset))
         finally:

@@ -82,7 +82,9 @@ class ImitationTask:
     def _window(self, config: Mapping[str, Any], dataset: Dataset, problem: Problem) -> TargetWindow:
         if dataset.states is None or problem.path_followed is None:
             raise InputError("configuration", "model.inputs", f"{WINDOW} needs states to follow and their path")
-        ahead = tuple(int(frames) for frames in config["task"]["ahead"])
+        ahead = tuple(int(frames) for frames in config["task"].get("ahead", ()))
+        if not ahead or min(ahead) < 1:
+            raise InputError("configuration", "task.ahead", f"{WINDOW} needs frames ahead of the body, not {ahead}")
         return TargetWindow(dataset.states, problem.path_followed, dataset.takes.last(), ahead)
 
     def starts(

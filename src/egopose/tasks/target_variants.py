@@ -30,7 +30,7 @@ from egopose.motion.rotations import Array
 
 @dataclass(frozen=True)
 class TargetError:
-    """How far what is followed is from the truth. Standard deviations of smooth noise, in time and over takes.
+    """How far the target motion is from the truth. Standard deviations of smooth noise, in time and over takes.
 
     Args:
         joints: rad, of every joint angle.
@@ -52,10 +52,11 @@ class TargetError:
 
 def smooth_noise(rng: np.random.Generator, frames: int, columns: int, deviation: float) -> Array:
     """``[frames, columns]`` noise of unit variance, correlated over ``deviation`` frames."""
-    reach = int(4 * deviation) + 1
-    noise = gaussian_filter1d(rng.normal(size=(frames + 2 * reach, columns)), deviation, axis=0)[reach:-reach]
-    # A Gaussian filter leaves 1 / (2 sqrt(pi) sigma) of white noise's variance.
-    return noise * np.sqrt(2.0 * np.sqrt(np.pi) * max(deviation, 0.3))
+    sigma = max(deviation, 0.01)  # white noise, which SciPy's filter refuses to give
+    reach = int(4 * sigma) + 1
+    noise = gaussian_filter1d(rng.normal(size=(frames + 2 * reach, columns)), sigma, axis=0)[reach:-reach]
+    kernel = gaussian_filter1d(np.eye(1, 2 * reach + 1, reach)[0], sigma)
+    return np.asarray(noise / np.sqrt((kernel**2).sum()))
 
 
 def with_error(qpos: Array, fps: float, joint_range: Array, error: TargetError, rng: np.random.Generator) -> Array:
@@ -89,7 +90,7 @@ def mirrored(humanoid: HumanoidModel, qpos: Array) -> Array:
 
 @dataclass(frozen=True)
 class Variants:
-    """Takes with what is followed beside what is true, one after the other.
+    """Takes with the target motion beside the true one, one after the other.
 
     Args:
         reference: body states ``[F]``.
@@ -124,7 +125,7 @@ def target_variants(
         humanoid: whose motion it is.
         clips: ``qpos [T, nq]`` at the control rate.
         fragments: of the clips.
-        errors: of what is followed.
+        errors: of the target motion.
         mirror: whether mirror images are added.
         seed: of the errors.
     """

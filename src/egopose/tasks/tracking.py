@@ -39,9 +39,12 @@ class Tracking(ImitationTask):
     name, protocol = "tracking", "survival"
 
     def check(self, config: Mapping[str, Any]) -> None:
-        """Raises InputError: the policy cannot see what it should follow."""
+        """Raises InputError: the policy cannot see what it should follow, or it is never, or not first, the truth."""
         if WINDOW not in config["model"]["inputs"]:
             raise InputError("configuration", "model.inputs", f"a tracker follows {WINDOW}: model=tracking")
+        free = [number for number, row in enumerate(config["task"]["errors"]) if row is None]
+        if free != [0]:
+            raise InputError("configuration", "task.errors", f"needs the truth (null) first and once, not at {free}")
 
     def dataset(self, config: Mapping[str, Any], sources: Sources) -> Dataset:
         """Every training clip with each error of ``task.errors``, and its mirror image; test clips with each error.

@@ -1,6 +1,6 @@
 """A tracker learns what its teacher would do (:mod:`egopose.training.teacher`), before PPO takes over.
 
-Each lesson is seen many times: with other errors in what is followed, mirrored, and in states near its own, where the
+Each lesson is seen many times: with other errors in the target motion, mirrored, and in states near its own, where the
 teacher's gains tell the control. So the gains are targets for the policy's derivative.
 """
 
@@ -32,7 +32,7 @@ class CloningSettings:
         seconds: of learning, a round.
         batch: lessons a step.
         learning_rate, weight_decay: AdamW, with a linear warm-up and a fall to nothing.
-        truth: share of the lessons in which what is followed has no error.
+        truth: share of the lessons in which the target motion has no error.
         nearby: share of the lessons that are moved.
         place, turn, joints: m, rad and rad, standard deviations of the largest moves.
         linear, angular, joint_rates: m/s, rad/s and rad/s, likewise.
@@ -158,7 +158,7 @@ def clone(
     settings: CloningSettings,
     progress: Callable[[int, float, float], None],
 ) -> float:
-    """Teach ``network(state, window) -> action``; the last mean squared error, rad^2.
+    """Teach ``network(state, window) -> action``; the mean squared error of the last steps, rad^2.
 
     Args:
         network: the policy's mean.
@@ -182,7 +182,8 @@ def clone(
         if step % _TOLD_EVERY == 0:
             error, total = total / _TOLD_EVERY, 0.0
             progress(step, error**0.5, time.monotonic() - began)
-    return error
+    left = step % _TOLD_EVERY
+    return total / left if left else error
 
 
 _WARM_UP, _TOLD_EVERY = 200, 500  # steps

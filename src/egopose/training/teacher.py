@@ -26,6 +26,7 @@ from egopose.motion.rotations import Array
 #: Controls ``[n, nu]`` rad of a policy at frames ``[n]`` in states ``[n, nq]``, ``[n, nv]``.
 Student = Callable[[NDArray[np.int64], Array, Array], Array]
 _TOO_FAST = 60.0  # m/s and rad/s: a body that broke
+_LARGEST_GAIN = 1e4  # half precision ends at 6.5e4
 
 
 @dataclass(frozen=True)
@@ -123,12 +124,17 @@ def head_heights(humanoid: HumanoidModel, qpos: Array) -> Array:
 
 
 def chunks(pieces: Sequence[Piece], offsets: Sequence[int], length: int) -> list[tuple[int, int, int]]:
-    """Pieces of motion of about ``length`` frames: first and last + 1 global frame, and the end of what may be seen."""
+    """Pieces of motion of about ``length`` frames: first and last + 1 global frame, and the end of what may be seen.
+
+    Neighbours share a frame, so that every step of the motion is in one.
+    """
     out = []
     for piece in pieces:
         count = max(1, round((piece.stop - piece.start) / length))
         bounds = np.linspace(piece.start, piece.stop, count + 1).astype(int) + offsets[piece.take]
-        out += [(int(a), int(b), int(bounds[-1])) for a, b in pairwise(bounds) if b - a > 1]
+        end = int(bounds[-1])
+        bodies = [(int(a), min(int(b) + 1, end), end) for a, b in pairwise(bounds)]
+        out += [(first, stop, end) for first, stop, end in bodies if stop - first > 1]
     return out
 
 
@@ -242,14 +248,15 @@ class _Bodies:
         """Of the bodies that are not through yet."""
         rows = np.flatnonzero(self._runs & (self._at + step < self._end - 1))
         qpos, qvel, led = (part[rows].astype(np.float32) for part in (self.qpos, self.qvel, ctrl))
-        return Lessons(self._at[rows] + step, qpos, qvel, led, self.gains[rows, step].astype(np.float16))
+        gains = np.clip(self.gains[rows, step], -_LARGEST_GAIN, _LARGEST_GAIN)
+        return Lessons(self._at[rows] + step, qpos, qvel, led, gains.astype(np.float16))
 
     def advance(self, humanoid: HumanoidModel) -> int:
         """A plan is through: stop bodies at their end and those that were lost; how many were."""
         settings = self._settings
         self._at += settings.every
         # Not below a bound, so that what is no number is broken too.
-        broken = ~(np.abs(np.concatenate([self.qpos, self.qvel], axis=1)).max(1) < _TOO_FAST)
+        broken = ~(np.abs(self.qvel).max(1) < _TOO_FAST)
         self.qpos[broken], self.qvel[broken] = self._motion.qpos[0], 0.0
         wanted = self._motion.heads[self.frames(0)]
         lost = self._runs & (broken | (head_heights(humanoid, self.qpos) < wanted - settings.lost))

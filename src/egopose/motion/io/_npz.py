@@ -28,24 +28,32 @@ def entry_names(path: Path) -> list[str]:
         return [info.filename.removesuffix(".npy") for info in archive.infolist()]
 
 
-def read_arrays(path: Path, names: Iterable[str]) -> dict[str, np.ndarray]:
+def read_arrays(
+    path: Path, names: Iterable[str], max_bytes: int = MAX_UNPACKED_BYTES, max_numbers: int = MAX_NUMBERS
+) -> dict[str, np.ndarray]:
     """Those of the named arrays that are there; objects (pickles) are refused.
 
+    Args:
+        path: of the file.
+        names: of arrays.
+        max_bytes: that are unpacked from the file.
+        max_numbers: of one array.
+
     Raises:
-        InputError: not a zip, encrypted, more than :data:`MAX_UNPACKED_BYTES` announced, an array whose header does not
-            agree with its size, damaged data.
+        InputError: not a zip, encrypted, more announced than is unpacked, an array whose header does not agree with its
+            size, damaged data.
     """
     arrays = {}
     with _open(path) as archive:
         there = {info.filename: info for info in archive.infolist()}
         wanted = [(name, there[f"{name}.npy"]) for name in names if f"{name}.npy" in there]
         total = sum(info.file_size for _, info in wanted)
-        if total > MAX_UNPACKED_BYTES:
-            cause = f"{total} bytes announced once unpacked; at most {MAX_UNPACKED_BYTES} are read"
+        if total > max_bytes:
+            cause = f"{total} bytes announced once unpacked; at most {max_bytes} are read"
             raise InputError(path, ", ".join(name for name, _ in wanted), cause)
         for name, info in wanted:
             try:
-                arrays[name] = _read_array(path, name, archive, info)
+                arrays[name] = _read_array(path, name, archive, info, max_numbers)
             except InputError:
                 raise
             except Exception as error:  # zipfile, zlib and NumPy raise whatever the damage happens to be
@@ -87,7 +95,7 @@ def _one_line(error: Exception) -> str:
     return " ".join((str(error) or type(error).__name__).split())[:160]
 
 
-def _read_array(path: Path, name: str, archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> np.ndarray:
+def _read_array(path: Path, name: str, archive: zipfile.ZipFile, info: zipfile.ZipInfo, max_numbers: int) -> np.ndarray:
     if info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
         raise InputError(path, name, f"compression {info.compress_type} is not one that NumPy writes")
     with archive.open(info) as stream:
@@ -100,8 +108,8 @@ def _read_array(path: Path, name: str, archive: zipfile.ZipFile, info: zipfile.Z
             raise InputError(path, name, "holds pickled objects; only plain arrays are read")
         if dtype.kind not in "biuf" or dtype.subdtype is not None:
             raise InputError(path, name, f"holds {str(dtype)[:40]!r}, which are no numbers")
-        if math.prod(shape) > MAX_NUMBERS:
-            raise InputError(path, name, f"shape {str(shape)[:60]}: more than {MAX_NUMBERS} numbers")
+        if math.prod(shape) > max_numbers:
+            raise InputError(path, name, f"shape {str(shape)[:60]}: more than {max_numbers} numbers")
         announced, there = math.prod(shape) * dtype.itemsize, info.file_size - stream.tell()
         if announced != there:
             raise InputError(path, name, f"shape {shape} of {dtype} takes {announced} bytes, {there} are there")
