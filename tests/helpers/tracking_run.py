@@ -21,15 +21,15 @@ class StandInSources:
     """Two takes of the stand-in's motion, and one more as a set of its own."""
 
     def __init__(self) -> None:
-        self.asked: list[tuple[str, str]] = []
+        self.asked: list[tuple[Any, ...]] = []
 
     def motions(self) -> Dataset:
         humanoid: Any = stand_in()
         reference, takes = reference_motion(humanoid)
         return Dataset(humanoid, reference, takes, TRAIN, TEST)
 
-    def other_motions(self, name: str, folder: str) -> Dataset:
-        self.asked.append((name, folder))
+    def other_motions(self, name: str, folder: str, subjects: Any) -> Dataset:
+        self.asked.append((name, folder, subjects))
         humanoid: Any = stand_in()
         reference, takes = reference_motion(humanoid, (30,))
         reference["qpos"][:, 0] += 100.0
@@ -39,10 +39,10 @@ class StandInSources:
 def configuration(folder: str | None = None, **training: Any) -> dict[str, Any]:
     loop = {**LOOP, "steps_per_iteration": 48, "iterations": 4, "checkpoint_every": 2, **training}
     own = {key: loop.pop(key) for key in LOOP_IN_ALGO}
-    model = group("model", "tracking")
+    model, task = group("model", "tracking"), group("task", "tracking")
     return {
         "seed": 5,
-        "task": {**group("task", "tracking"), "horizon": 12, "minimum": 6, "also": {"cmu6": folder}},
+        "task": {**task, "horizon": 12, "minimum": 6, "also": {"cmu6": {**task["also"]["cmu6"], "folder": folder}}},
         "reward": group("reward", "tracking"),
         "regressor": {"std_floor": 0.05},
         "model": {**model, "hidden": [8], "critic": {**model["critic"], "hidden": [8]}},

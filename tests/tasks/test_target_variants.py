@@ -42,7 +42,7 @@ def test_without_an_error_what_is_followed_is_the_reference() -> None:
     torch.testing.assert_close(found.joint_targets, reference["qpos"][:, 7:].float())
     path = root_on_floor(reference["qpos"])
     torch.testing.assert_close(found.path, path, atol=1e-9, rtol=0)
-    assert found.pieces == found.first == list(FRAGMENTS)
+    assert found.pieces == found.unmirrored == list(FRAGMENTS)
     assert torch.equal(found.takes.offsets, takes.offsets)
     torch.testing.assert_close(found.takes.lowest_head_height, takes.lowest_head_height)
 
@@ -60,7 +60,7 @@ def test_copies_stand_side_by_side_and_only_what_is_followed_differs() -> None:
     assert found.takes.lengths.tolist() == [40, 25] * 4
     assert found.takes.offsets.tolist() == [0, 40, 65, 105, 130, 170, 195, 235]
     assert found.pieces == [Piece(2 * copy + f.take, f.start, f.stop) for copy in range(4) for f in FRAGMENTS]
-    assert found.first == list(FRAGMENTS)
+    assert found.unmirrored == found.pieces[: 2 * len(FRAGMENTS)]
 
 
 def test_the_mirror_image_is_what_a_mirror_shows() -> None:

@@ -23,12 +23,14 @@ from egopose.training.loop import Run, iterate, train
 
 
 def test_every_clip_trains_with_each_error_and_mirrored() -> None:
-    """Three copies of two clips on either side; test fragments once, of the first copy."""
+    """Three copies of two clips on either side; test fragments of the three copies on one."""
     dataset = tracking_dataset()
     assert [(p.take, p.start, p.stop) for p in dataset.train] == [
         (2 * copy + f.take, f.start, f.stop) for copy in range(6) for f in TRAIN
     ]
-    assert [(p.take, p.start, p.stop) for p in dataset.test] == [(f.take, f.start, f.stop) for f in TEST]
+    assert [(p.take, p.start, p.stop) for p in dataset.test] == [
+        (2 * copy + f.take, f.start, f.stop) for copy in range(3) for f in TEST
+    ]
     assert dataset.reference.shape == (6 * 65,)
     for table in (dataset.states, dataset.path, dataset.joint_targets):
         assert table is not None
@@ -46,8 +48,10 @@ def test_without_mirroring_there_are_half_as_many() -> None:
 def test_other_sets_train_and_are_not_tested() -> None:
     sources = StandInSources()
     dataset = tracking_dataset(configuration("elsewhere"), sources)
-    assert sources.asked == [("cmu6", "elsewhere")]
-    assert [(p.take, p.start, p.stop) for p in dataset.test] == [(f.take, f.start, f.stop) for f in TEST]
+    assert sources.asked == [("cmu6", "elsewhere", ("1", "6", "7"))]
+    assert [(p.take, p.start, p.stop) for p in dataset.test] == [
+        (3 * copy + f.take, f.start, f.stop) for copy in range(3) for f in TEST
+    ]
     other = [p for p in dataset.train if p.take % 3 == 2]
     assert [(p.start, p.stop) for p in other] == [(ALSO[0].start, ALSO[0].stop)] * 6
     offset = int(dataset.takes.offsets[other[0].take])
@@ -159,8 +163,8 @@ def taught(tmp_path_factory: pytest.TempPathFactory) -> Run:
 
 
 def test_a_run_begins_from_anothers_policy_and_normaliser(taught: Run, tmp_path: Path) -> None:
-    """And with nothing else of it: critic, optimisers and counters are new."""
-    plain, run = made(tmp_path / "plain"), made(tmp_path / "run")
+    """And critic; but optimisers and counters are new."""
+    run = made(tmp_path / "run")
     start_from(run, str(taught.folder))
     for key, value in weights_of(taught).items():
         assert torch.equal(value, weights_of(run)[key]), key
@@ -169,7 +173,7 @@ def test_a_run_begins_from_anothers_policy_and_normaliser(taught: Run, tmp_path:
     for key in before:
         assert torch.equal(before[key], after[key]), key
     assert any(float(value.double().abs().max()) > 0 for value in after.values())
-    for key, value in plain.ppo.critic.state_dict().items():
+    for key, value in taught.ppo.critic.state_dict().items():
         assert torch.equal(value, run.ppo.critic.state_dict()[key]), key
     assert run.counters.iteration == 0
     assert run.ppo.policy_optimizer.state_dict()["state"] == {}
