@@ -18,8 +18,7 @@ from egopose.evaluation.resets import TakeTriggers, as_dict, take_triggers
 from egopose.inference.counterfactuals import CounterfactualRollouts
 from egopose.inference.estimator import Estimate, estimate_takes, restart_path
 from egopose.inference.failsafe import FailSafe, FailSafeSettings
-from egopose.inference.planner import Planner
-from egopose.inference.planner_settings import PlannerSettings, planned_threshold
+from egopose.inference.planners import AnyPlannerSettings, build_planner, planned_threshold
 from egopose.models.pose_regression import pose_regression
 from egopose.motion import rotations as rot
 from egopose.motion.motion import Motion
@@ -58,7 +57,7 @@ def evaluate_agent(
     contact: ContactSettings,
     threads: int,
     window: int | None = None,
-    planner: PlannerSettings | None = None,
+    planner: AnyPlannerSettings | None = None,
 ) -> list[FragmentResult]:
     """Estimate every fragment in one pass, all side by side, and score it beside PoseReg.
 
@@ -96,7 +95,7 @@ def estimate_and_judge(
     failsafe: FailSafeSettings,
     threads: int,
     window: int | None,
-    planner: PlannerSettings | None = None,
+    planner: AnyPlannerSettings | None = None,
 ) -> tuple[list[Estimate], Sequence[TakeTriggers | None]]:
     """Estimates of the first ``num_envs`` fragments of ``split``, and the fail-safe's triggers, judged.
 
@@ -128,7 +127,7 @@ def _together(
     failsafe: FailSafeSettings,
     threads: int,
     window: int | None,
-    planner: PlannerSettings | None,
+    planner: AnyPlannerSettings | None,
 ) -> tuple[list[Estimate], Sequence[TakeTriggers | None]]:
     """:func:`estimate_and_judge` of these fragments, in one pass."""
     worlds = len(fragments)
@@ -144,7 +143,7 @@ def _together(
     )
     ahead = None
     if planner is not None:
-        ahead = Planner(make_env(worlds * planner.samples), agent.actor, agent.critic, planner)
+        ahead = build_planner(make_env(worlds * planner.samples), agent.actor, agent.critic, planner)
     restart = restart_path(failsafe.restart, env, ahead)
     estimates = estimate_takes(
         env,

@@ -20,7 +20,7 @@ from egopose.evaluation.protocols import Comparison, ContactSettings, fragment_n
 from egopose.evaluation.report import HEADLINE
 from egopose.inference.failsafe import FailSafeSettings
 from egopose.inference.outputs import TakeVideo, write_footage, write_side_by_side
-from egopose.inference.planner_settings import planned_threshold, planner_settings
+from egopose.inference.planners import planned_threshold, read_planner
 from egopose.pipeline.agent import Agent
 from egopose.pipeline.networks import build_networks
 
@@ -68,7 +68,7 @@ def run_evaluation(
     source = "conf/evaluate.yaml"
     failsafe = from_mapping(FailSafeSettings, config["failsafe"], f"{source}: failsafe")
     contact = from_mapping(ContactSettings, config["contact"], f"{source}: contact")
-    planner = planner_settings(config.get("planner"))
+    planner = read_planner(config.get("planner"))
     split, threads, dataset = str(config["split"]), int(config["threads"]), agents[0].dataset
     if split not in ("train", "test"):
         raise InputError(source, "split", f"must be train or test, not {split!r}")

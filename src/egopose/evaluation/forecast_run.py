@@ -28,8 +28,7 @@ from egopose.inference.forecast_contexts import SOURCES, past_states
 from egopose.inference.forecast_start import begin_forecasts
 from egopose.inference.forecaster import Forecasts, forecast
 from egopose.inference.outputs import RENDERED_NOTE, TakeVideo, file_name, write_footage, write_motion_files
-from egopose.inference.planner import Planner
-from egopose.inference.planner_settings import PlannerSettings, planner_settings
+from egopose.inference.planners import AnyPlannerSettings, build_planner, read_planner
 from egopose.models.baselines.recurrent import RecurrentForecaster
 from egopose.motion.io import write_motion
 from egopose.motion.motion import Motion
@@ -111,7 +110,7 @@ def run_forecast_evaluation(
     truth = _truth(dataset, windows)
     hands = [int(d) for d in humanoid.hand_dofs]
 
-    planner = planner_settings(config.get("planner"))
+    planner = read_planner(config.get("planner"))
     methods: dict[str, list[Any]] = {OURS: [], DRAWN: [], STILL: []}
     coverage, futures = [], []
     others: dict[str, Array] = {}  # of the first run: [W, H, nq] of whatever it is compared with
@@ -217,7 +216,7 @@ def forecast_windows_of(
     samples: int,
     settings: ForecastSettings,
     threads: int,
-    planner: PlannerSettings | None = None,
+    planner: AnyPlannerSettings | None = None,
 ) -> Forecasts:
     """:func:`egopose.inference.forecaster.forecast` of all windows, as many at a time as ``settings.worlds`` allow.
 
@@ -237,7 +236,7 @@ def forecast_windows_of(
             now = torch.tensor([int(agent.dataset.takes.offsets[w.take]) + w.now for w in part])
             copies = agent.make_env(num_envs=len(part) * planner.samples, fragments=part, **options)
             followed = copies.base_env.problem.followed(now)
-            ahead = Planner(copies, agent.actor, agent.critic, planner, followed)
+            ahead = build_planner(copies, agent.actor, agent.critic, planner, followed)
         with torch_threads(1):
             parts.append(forecast(env, agent.actor, qpos, qvel, samples, horizon, seed, settings.noise_time, ahead))
         env.close()

@@ -29,7 +29,7 @@ from egopose.inference.acting import Acting, acting
 from egopose.inference.counterfactuals import CounterfactualRollouts
 from egopose.inference.failsafe import FailSafe
 from egopose.inference.followed_path import FollowedPath
-from egopose.inference.planner import Planner
+from egopose.inference.planners import AnyPlanner
 from egopose.models.pose_regression import state_to_qpos
 from egopose.motion import rotations as rot
 from egopose.motion.motion import Motion
@@ -97,7 +97,7 @@ def estimate_takes(
     guard: FailSafe,
     lookahead: int | None = None,
     counterfactuals: CounterfactualRollouts | None = None,
-    planner: Planner | None = None,
+    planner: AnyPlanner | None = None,
     restart: FollowedPath | None = None,
     watch: Callable[[Array], None] | None = None,
 ) -> list[Estimate]:
@@ -191,7 +191,7 @@ def estimate_takes(
     ]
 
 
-def restart_path(restart: str, env: TransformedEnv, planner: Planner | None) -> FollowedPath | None:
+def restart_path(restart: str, env: TransformedEnv, planner: AnyPlanner | None) -> FollowedPath | None:
     """The path at which bodies of ``env`` restart, by ``failsafe.restart``; None for ``own``.
 
     It is the planner's. Without a planner nothing draws a body to its path, and the path is not drawn to the body.

@@ -18,7 +18,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from egopose.envs.env import EgoPoseEnv
 from egopose.envs.test_time import Controller, prepare_for_test
-from egopose.inference.planner import Planner
+from egopose.inference.planners import AnyPlanner
 from egopose.motion.rotations import Array
 
 
@@ -47,7 +47,7 @@ def forecast(
     horizon: int = 90,
     seed: int = 0,
     noise_time: float = 0.0,
-    planner: Planner | None = None,
+    planner: AnyPlanner | None = None,
 ) -> Forecasts:
     """Roll the policy out from the given states.
 

@@ -92,11 +92,6 @@ class PlannerSettings:
         check(known and own and not table.needs, "reward", cause)
 
 
-def planned_threshold(settings: PlannerSettings | None) -> float | None:
-    """The fail-safe's reset_threshold for a planner's values; None without a planner."""
-    return None if settings is None else settings.reset_threshold
-
-
 def planner_settings(values: Mapping[str, Any] | None) -> PlannerSettings | None:
     """Settings of a resolved ``conf/planner``; None for its file ``none``, or where there is none.
 

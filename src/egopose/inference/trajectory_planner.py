@@ -68,6 +68,11 @@ class TrajectoryPlannerSettings:
             if not getattr(self, name) > 0:
                 raise InputError("planner", name, "must be positive")
 
+    @property
+    def samples(self) -> int:
+        """Copies of each body that its planner simulates with the policy."""
+        return 1
+
     @classmethod
     def from_config(cls, values: Mapping[str, Any]) -> TrajectoryPlannerSettings:
         """Raises InputError: a value is missing, unknown or wrong."""

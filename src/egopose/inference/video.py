@@ -25,8 +25,7 @@ from egopose.inference.film_agreement import film_agreement
 from egopose.inference.film_process import Drawing, FilmProcess, FilmSettings, was_rendered
 from egopose.inference.film_states import FilmReading, read_states, require_states_for_context, seen_in_film
 from egopose.inference.outputs import TakeVideo, write_footage, write_motion_files
-from egopose.inference.planner import Planner
-from egopose.inference.planner_settings import PlannerSettings, planned_threshold, planner_settings
+from egopose.inference.planners import AnyPlannerSettings, build_planner, planned_threshold, read_planner
 from egopose.inference.progress import StageProgress
 from egopose.inference.video_regression import (
     causal_regression,
@@ -89,7 +88,7 @@ def run_estimate(
     planner = None
     if settings is not None:
         copies = agent.make_env("test", num_envs=settings.samples, **{**options, "threads": int(config["threads"])})
-        planner = Planner(copies, agent.actor, agent.critic, settings)
+        planner = build_planner(copies, agent.actor, agent.critic, settings)
     humanoid = agent.dataset.humanoid
     seen = TakeVideo(film.settings.video, film.settings.offset, rendered=False, taken_at=film.settings.camera.fps)
     known = {"PoseReg": pose_motion.qpos}
@@ -139,7 +138,7 @@ def warn_of_film(video: Path, body_parts: bool) -> None:
         )
 
 
-def allowed_planner(config: Mapping[str, Any]) -> PlannerSettings | None:
+def allowed_planner(config: Mapping[str, Any]) -> AnyPlannerSettings | None:
     """The planner's settings by ``conf/estimate.yaml``; None for no planner.
 
     ``causal`` has no planner: its look-ahead is ``lookahead`` frames, and a planner's horizon is longer.
@@ -147,7 +146,7 @@ def allowed_planner(config: Mapping[str, Any]) -> PlannerSettings | None:
     Raises:
         InputError: a setting is missing or wrong.
     """
-    settings = planner_settings(config.get("planner"))
+    settings = read_planner(config.get("planner"))
     return None if config["causal"] else settings
 
 

@@ -1,0 +1,50 @@
+"""The planners there are, by ``conf/planner``: random shooting, and iterative LQR."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, TypeAlias
+
+from tensordict.nn import TensorDictModuleBase
+from torchrl.envs import TransformedEnv
+
+from egopose.envs.problem import Followed
+from egopose.inference.planner import Planner
+from egopose.inference.planner_settings import PlannerSettings, planner_settings
+from egopose.inference.trajectory_planner import TrajectoryPlanner, TrajectoryPlannerSettings
+
+AnyPlanner: TypeAlias = Planner | TrajectoryPlanner
+AnyPlannerSettings: TypeAlias = PlannerSettings | TrajectoryPlannerSettings
+
+
+def read_planner(values: Mapping[str, Any] | None) -> AnyPlannerSettings | None:
+    """Settings of a resolved ``conf/planner``; None for its file ``none``, or where there is none.
+
+    Raises:
+        InputError: a value is missing, unknown or wrong.
+    """
+    if values and values.get("kind") == "trajectory":
+        return TrajectoryPlannerSettings.from_config({key: value for key, value in values.items() if key != "kind"})
+    return planner_settings(values)
+
+
+def build_planner(
+    env: TransformedEnv,
+    actor: TensorDictModuleBase,
+    critic: TensorDictModuleBase,
+    settings: AnyPlannerSettings,
+    followed: Followed | None = None,
+) -> AnyPlanner:
+    """The planner of these settings; ``env`` holds ``settings.samples`` copies of each body.
+
+    Raises:
+        InputError: see :class:`Planner` and :class:`TrajectoryPlanner`.
+    """
+    if isinstance(settings, TrajectoryPlannerSettings):
+        return TrajectoryPlanner(env, actor, critic, settings, followed)
+    return Planner(env, actor, critic, settings, followed)
+
+
+def planned_threshold(settings: AnyPlannerSettings | None) -> float | None:
+    """The fail-safe's reset_threshold for a planner's values; None without a planner, or where it has none."""
+    return None if settings is None else settings.reset_threshold
