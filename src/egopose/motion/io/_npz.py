@@ -29,20 +29,22 @@ def entry_names(path: Path) -> list[str]:
 
 
 def read_arrays(
-    path: Path, names: Iterable[str], max_bytes: int = MAX_UNPACKED_BYTES, max_numbers: int = MAX_NUMBERS
+    path: Path, names: Iterable[str], max_bytes: int | None = None, max_numbers: int | None = None
 ) -> dict[str, np.ndarray]:
     """Those of the named arrays that are there; objects (pickles) are refused.
 
     Args:
         path: of the file.
         names: of arrays.
-        max_bytes: that are unpacked from the file.
-        max_numbers: of one array.
+        max_bytes: that are unpacked from the file; None for :data:`MAX_UNPACKED_BYTES`.
+        max_numbers: of one array; None for :data:`MAX_NUMBERS`.
 
     Raises:
         InputError: not a zip, encrypted, more announced than is unpacked, an array whose header does not agree with its
             size, damaged data.
     """
+    max_bytes = MAX_UNPACKED_BYTES if max_bytes is None else max_bytes
+    max_numbers = MAX_NUMBERS if max_numbers is None else max_numbers
     arrays = {}
     with _open(path) as archive:
         there = {info.filename: info for info in archive.infolist()}
