@@ -16,7 +16,7 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 
 HERE = Path(__file__).parent
-KEPT = ("step", "hours", "evaluation/score", "evaluation/falls", "episode_length", "reward", "kl", "steps_per_s")
+KEPT = ("steps", "hours", "evaluation/score", "evaluation/falls", "episode_length", "reward", "kl", "steps_per_s")
 BEGIN, END = "<!-- table -->", "<!-- end -->"
 
 
@@ -52,13 +52,13 @@ def main() -> None:
         if not rows:
             continue
         survived = [row["evaluation/score"] for row in rows]
-        axes[0].plot([row["step"] / 1e6 for row in rows], survived, label=path.stem)
+        axes[0].plot([row["steps"] / 1e6 for row in rows], survived, label=path.stem)
         axes[1].plot([row["hours"] for row in rows], survived)
         last = rows[-1]
         lines.append(
-            f"| {path.stem.replace('_', ' ')} | {last['step'] / 1e6:.1f} | {last['hours']:.2f} | {survived[0]:.1f} -> "
-            f"{survived[-1]:.1f} | {max(survived):.1f} | {last['evaluation/falls']:.0%} | {last.get('reward', 0):.3f} | "
-            f"{last.get('kl', 0):.3f} | {last.get('steps_per_s', 0):.0f} |"
+            f"| {path.stem.replace('_', ' ')} | {last['steps'] / 1e6:.1f} | {last['hours']:.2f} | {survived[0]:.1f} -> "
+            f"{survived[-1]:.1f} | {max(survived):.1f} | {last['evaluation/falls']:.0%} | {last.get('reward', 0):.3f} "
+            f"| {last.get('kl', 0):.3f} | {last.get('steps_per_s', 0):.0f} |"
         )
     axes[0].set(xlabel="million control steps", ylabel="frames survived by the mean action, of 149")
     axes[1].set(xlabel="hours of training on two cores")

@@ -29,6 +29,7 @@ from egopose.envs.test_time import prepare_for_test
 from egopose.evaluation import forecast_run as forecast_evaluation
 from egopose.evaluation.forecast_run import ForecastSettings, forecast_windows_of
 from egopose.humanoid.state_layout import StateLayout
+from egopose.inference import planners
 from egopose.inference.forecaster import forecast
 from egopose.inference.planner import Planner
 from egopose.inference.planner_settings import PlannerSettings
@@ -231,7 +232,7 @@ def made(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
             super().close()
             self.closed = True
 
-    monkeypatch.setattr(forecast_evaluation, "Planner", Counted)
+    monkeypatch.setattr(planners, "Planner", Counted)
     return there
 
 
@@ -285,7 +286,7 @@ def test_an_agent_that_follows_no_forecast_does_not_look_ahead(
     monkeypatch.setattr(forecast_evaluation, "forecast", told)
     blind = replace(agent, dataset=replace(agent.dataset, forecasts=None))
     states = begun(agent, WINDOWS)
-    for one, planners in ((blind, 0), (agent, 1)):
+    for one, count in ((blind, 0), (agent, 1)):
         forecast_windows_of(one, WINDOWS, states, 1, FORECAST, 1, settings(**SMALL))
-        assert len(made) == planners
+        assert len(made) == count
     assert asked == [None, made[0]]

@@ -214,9 +214,8 @@ class TrajectoryOptimiser:
             added: ``[N, H, nu]`` of its controls from the feed-forward.
         """
         weights = torch.from_numpy(self.cost.weights(wrong.shape[-1] // 2)).float()
-        # A body that breaks within the horizon has no derivatives: its plan stays as it was.
-        a_all, b_all = torch.from_numpy(state).nan_to_num(0, 0, 0), torch.from_numpy(control).nan_to_num(0, 0, 0)
-        error, extra = torch.from_numpy(wrong).float().nan_to_num(0, 0, 0), torch.from_numpy(added).float()
+        a_all, b_all = torch.from_numpy(state), torch.from_numpy(control)
+        error, extra = torch.from_numpy(wrong).float(), torch.from_numpy(added).float()
         curvature = torch.diag(self.cost.last * weights).expand(len(a_all), -1, -1)
         slope = self.cost.last * weights * error[:, -1]
         changes: list[Tensor] = []
@@ -229,6 +228,9 @@ class TrajectoryOptimiser:
             qu = (b.mT @ slope[..., None])[..., 0] + self.cost.control * extra[:, t]
             qx = (a.mT @ slope[..., None])[..., 0] + weights * error[:, t]
             solved = -torch.cholesky_solve(torch.cat([qux, qu[..., None]], dim=-1), _factor(quu))
+            # A step that broke has derivatives beyond all numbers: that body's controls stay, the others' do not mind.
+            sound = solved.isfinite().all(-1).all(-1)
+            solved = torch.where(sound[:, None, None], solved, 0.0)
             gain, change = solved[..., :-1], solved[..., -1]
             changes.append(change)
             gains.append(gain)
