@@ -40,7 +40,8 @@ def one_thread() -> Iterator[None]:
 
 
 def settings_of(**changed: Any) -> dict[str, Any]:
-    return {**compose_config("stream", ["source=none", "checkpoint=none", "server.port=null"]), **changed}
+    words = ["source=none", "checkpoint=none", "server.port=null", "planner=none"]
+    return {**compose_config("stream", words), **changed}
 
 
 @pytest.fixture(scope="module")
@@ -152,7 +153,7 @@ def test_features_and_what_is_seen_are_the_offline_ones(walk: Path) -> None:
     rows: list[Seen] = []
     regression = loop._regression
     advance = loop._body.advance
-    loop._body.advance = lambda seen: rows.append(seen) or advance(seen)  # type: ignore[method-assign]
+    loop._body.advance = lambda seen, deadline=0.0: rows.append(seen) or advance(seen)  # type: ignore[method-assign]
     poses: list[LivePose] = []
     loop.run(lambda pose, delay: poses.append(pose), lambda status: None)
     causal = causal_regression(

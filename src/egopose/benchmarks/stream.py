@@ -13,6 +13,7 @@ from typing import Any
 
 import torch
 from torch import Tensor
+from torchrl.envs import TransformedEnv
 
 from egopose.core.config import compose_config, from_mapping
 from egopose.core.errors import InputError
@@ -21,6 +22,7 @@ from egopose.data.spans import Span
 from egopose.envs.mdp.observations import humanoid_state
 from egopose.humanoid.model import HumanoidModel
 from egopose.inference.stream.build import (
+    ROWS,
     Forecaster,
     Trained,
     build_loop,
@@ -187,10 +189,15 @@ def untrained_on(config: Mapping[str, Any], humanoid: HumanoidModel, states: Ten
     settings = from_mapping(RegressorSettings, config["regressor"], "conf/regressor")
     regressor = build_regressor(encoder, states, [Span(0, len(states))], settings, encoder.features).eval()
     source_config = {"vision": config["vision"], "regressor": config["regressor"]}
-    dataset = still_frames(humanoid, regressor, source_config)
-    env = build_env(config, dataset, "test", num_envs=1, whole_fragments=True, falls_end=False)
+    dataset = still_frames(humanoid, regressor, source_config, ROWS)
+
+    def made(worlds: int, threads: int) -> TransformedEnv:
+        options: dict[str, Any] = {"whole_fragments": True, "falls_end": False}
+        return build_env(config, dataset, "test", num_envs=worlds, threads=threads, **options)
+
+    env = made(1, 1)
     actor, critic = build_networks(config, dataset, env)
-    return Trained(humanoid, regressor, source_config, env, actor.eval(), critic.eval(), config)
+    return Trained(humanoid, regressor, source_config, env, made, actor.eval(), critic.eval(), config)
 
 
 def untrained_forecaster(values: Mapping[str, Any], trained: Trained) -> Forecaster:

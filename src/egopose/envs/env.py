@@ -333,17 +333,21 @@ class EgoPoseEnv(EnvBase):
         stopped = self.physics.step(self._target(tensordict["action"], ALL))
         return TensorDict(self._arrived(stopped, ALL), batch_size=self.batch_size)
 
-    def try_step(self, action: Tensor) -> tuple[BodyView, dict[str, Tensor]]:
+    def try_step(self, action: Tensor) -> dict[str, Tensor]:
         """A trial step under ``action [N, A]``: there is no reward, and no episode ends.
 
         Returns:
-            The bodies, and the entries of their observations.
+            The entries of the bodies' observations.
         """
         stopped = self.physics.step(self._target(action, ALL))
-        body = self.problem.view({k: torch.from_numpy(v) for k, v in self.physics.body_state().items()})
         clock, diverged = self._clock(), torch.from_numpy(stopped[:, None])
-        seen = self._observations(body, clock["frame"].squeeze(-1))
-        return body, {**clock, **self._no_flags, "diverged": diverged, **seen}
+        seen = self._observations(_Lazily(self.physics, ALL), clock["frame"].squeeze(-1))
+        return {**clock, **self._no_flags, "diverged": diverged, **seen}
+
+    def bodies(self, qpos: Array, qvel: Array) -> BodyView:
+        """Bodies ``[n]`` at ``qpos [n, nq]`` and ``qvel [n, nv]``, which are in no world."""
+        state = {"qpos": qpos, "qvel": qvel, **self.physics.poses(qpos)}
+        return self.problem.view({name: torch.from_numpy(value) for name, value in state.items()})
 
     def begin_step(self, action: Tensor, worlds: slice) -> None:
         """Have the physics' threads take a step of ``worlds``, a range, under ``action [n, A]``, while the caller works

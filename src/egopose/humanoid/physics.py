@@ -345,15 +345,12 @@ class BatchedPhysics:
             ``box_quaternions [n, K, 4]``. What was asked for of ``floor_contacts``, ``box_contacts``, ``torques``.
         """
         qpos = self.qpos[worlds].copy()
+        return {"qpos": qpos, "qvel": self.qvel[worlds].copy(), **self.poses(qpos), **self._scene(worlds)}
+
+    def poses(self, qpos: Array) -> dict[str, Array]:
+        """``xpos [n, B, 3]`` m, ``xquat [n, B, 4]`` and ``com [n, 3]`` m of bodies at ``qpos [n, nq]``, in no world."""
         xpos, xquat, xipos = self._placer(qpos)
-        return {
-            "qpos": qpos,
-            "qvel": self.qvel[worlds].copy(),
-            "xpos": xpos,
-            "xquat": xquat,
-            "com": self._mass @ xipos,
-            **self._scene(worlds),
-        }
+        return {"xpos": xpos, "xquat": xquat, "com": self._mass @ xipos}
 
     def _scene(self, worlds: slice) -> dict[str, Any]:
         out: dict[str, Any] = {}

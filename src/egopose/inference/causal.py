@@ -24,6 +24,21 @@ from egopose.models.regressor import StateRegressor
 
 
 @dataclass(frozen=True)
+class Later:
+    """What is known of the frames of a look-ahead, as they look at its end; their own look-aheads are not in.
+
+    Attributes:
+        visual_context: ``[K, C]``, as in :class:`Seen`; so are the others.
+        humanoid_state: ``[K, S]``.
+        joint_targets: ``[K, nu]`` rad.
+    """
+
+    visual_context: Tensor
+    humanoid_state: Tensor
+    joint_targets: Tensor
+
+
+@dataclass(frozen=True)
 class Seen:
     """What is known of a frame once its look-ahead is in.
 
@@ -33,6 +48,7 @@ class Seen:
         visual_context: ``[C]`` as a policy with a frozen context reads it.
         humanoid_state: ``[S]`` the regressor's, in its own units.
         joint_targets: ``[nu]`` rad, its joint angles within the joints' range.
+        later: of the frames after it, where a planner asks for them.
     """
 
     frame: int
@@ -40,6 +56,7 @@ class Seen:
     visual_context: Tensor
     humanoid_state: Tensor
     joint_targets: Tensor
+    later: Later | None = None
 
 
 class CausalRegression:
@@ -51,6 +68,7 @@ class CausalRegression:
         lookahead: frames.
         context_of_states: policies read the regressor's normalised state for a context (runs on cross-fitted tables).
         smoothing: standard deviation in frames of the Gaussian over what was seen; 0 for none.
+        tells_later: say of each frame what is known of those after it.
     """
 
     def __init__(
@@ -60,7 +78,9 @@ class CausalRegression:
         lookahead: int,
         context_of_states: bool = False,
         smoothing: float = 0.0,
+        tells_later: bool = False,
     ) -> None:
+        self._tells_later = tells_later
         self._regressor, self._lookahead, self._context_of_states = regressor, lookahead, context_of_states
         self._low, self._high = joint_range.float().T
         self._state: LstmState | None = None
@@ -84,15 +104,18 @@ class CausalRegression:
     def _next(self) -> Seen:
         window = torch.stack([features for _, features in self.pending])
         frame, _ = self.pending.popleft()
-        if self._weights is None:
+        if self._weights is None and not self._tells_later:
             context, self._state = self._regressor.context.causal_step(window[None], self._state)
-            row = self._rows(context)[0]
+            rows = self._rows(context)
         else:
             contexts, self._state = self._regressor.context.causal_window(window[None], self._state)
-            row = self._smooth(self._rows(contexts[0]))
+            rows = self._rows(contexts[0])
+        if self._weights is not None:
+            rows = self._smooth(rows)
         states, joints = self._regressor.state_mean.shape[0], self._low.shape[0]
-        state, angles, read = row.split([states, joints, len(row) - states - joints])
-        return Seen(frame, window, read, state, angles)
+        state, angles, read = rows.split([states, joints, rows.shape[1] - states - joints], dim=1)
+        later = Later(read[1:], state[1:], angles[1:]) if self._tells_later else None
+        return Seen(frame, window, read[0], state[0], angles[0], later)
 
     def _rows(self, context: Tensor) -> Tensor:
         """``[W, S + nu + C]``: state, joint targets and what the policy reads, of contexts ``[W, C]``."""
@@ -102,13 +125,16 @@ class CausalRegression:
         return torch.cat([states, angles, read], dim=-1)
 
     def _smooth(self, rows: Tensor) -> Tensor:
-        """The first of ``rows [W, N]`` smoothed over them and the past; beyond either end the outermost row stands."""
+        """Rows ``[W, N]`` smoothed over them and the past; beyond either end the outermost row stands. The first alone,
+        unless those after it are asked for."""
         assert self._weights is not None
+        count = len(rows) if self._tells_later else 1
         before = [self.past[0] if self.past else rows[0]] * (self._lookahead - len(self.past)) + list(self.past)
-        after = rows[-1:].expand(self._lookahead + 1 - len(rows), -1)
+        after = rows[-1:].expand(max(self._lookahead + count - len(rows), 0), -1)
         self.past.append(rows[0])
         table = torch.cat([torch.stack(before), rows, after]).double()
-        return (self._weights @ table).to(rows.dtype)
+        size = len(self._weights)
+        return torch.stack([self._weights @ table[at : at + size] for at in range(count)]).to(rows.dtype)
 
 
 def _gaussian(deviation: float, radius: int) -> Tensor:

@@ -14,7 +14,7 @@ it is past. Terms in the world (``heading``, ``path``) hold bodies to the path t
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from types import SimpleNamespace
 
 import numpy as np
@@ -30,7 +30,7 @@ from egopose.envs.forecasting_transforms import RecurrentStates
 from egopose.envs.mdp.rewards import build_reward
 from egopose.envs.mdp.step_view import StepView
 from egopose.envs.problem import Followed
-from egopose.humanoid.physics import PER_WORLD
+from egopose.humanoid.physics import PER_WORLD, Array
 from egopose.inference.followed_path import FollowedPath
 from egopose.inference.planner_settings import PlannerSettings
 from egopose.models.pose_regression import state_to_qpos
@@ -61,6 +61,10 @@ class Planner:
         value: ``[N]`` return of the best candidate: discounted rewards and, at the horizon, V. It is 0 while the head
             is more than ``lost`` below its target, so that a fallen body is reset. Terms in the world are no part of
             it: a body that strayed is not lost.
+        late: asked before each simulated step whether the time is up; never, unless it is set. The round under way is
+            then given up. The best of the whole rounds is taken; without any, the plan so far goes on.
+        plans: begun so far; ``plans_cut`` of them had fewer rounds than they should for want of time, and
+            ``plans_missed`` had none.
 
     Raises:
         InputError: actions are torques, the policy has a memory, or no hinge is named.
@@ -97,7 +101,7 @@ class Planner:
         if path is not None:
             self.path = FollowedPath(path, humanoid.control_dt, settings.place_time, settings.heading_time)
         env.reset()
-        self._followed, self._head_height = self._what_is_followed(states)
+        self.follow(states)
         hinges = [joint.name for joint in humanoid.skeleton.joints for _ in joint.dofs]
         chosen = [float(any(part in name for part in settings.joints)) for name in hinges]
         if not any(chosen):
@@ -108,34 +112,33 @@ class Planner:
         self._plan = torch.zeros(worlds, settings.horizon + settings.every, len(hinges))
         self._age = 0
         self._returns, self.value = torch.zeros(worlds), torch.zeros(worlds)
+        self.late: Callable[[], bool] = lambda: False
+        self.plans = self.plans_cut = self.plans_missed = 0
 
-    def _what_is_followed(self, states: Tensor) -> tuple[dict[str, Tensor], Tensor]:
-        """What the reward reads of the target motion, and the height of its heads ``[F]`` m.
+    def follow(self, states: Tensor) -> None:
+        """Take ``states [R, S]`` for the target motion's; a live stream knows a few at a time.
 
-        The bodies stand at the origin and face along x: the heading frame does not depend on it.
+        The bodies that the reward reads of stand at the origin and face along x: the heading frame does not depend on
+        it.
         """
-        problem, worlds = self._base.problem, self._base.batch_size[0]
-        views: list[dict[str, Tensor]] = []
-        heights = []
-        for rows in states.split(worlds):
-            facing = np.array([1.0, 0.0, 0.0, 0.0])
-            qpos, qvel = state_to_qpos(rows.double().numpy(), np.zeros(2), facing, problem.humanoid.joint_range)
-            self._base.place(torch.arange(len(rows)), torch.from_numpy(qpos), torch.from_numpy(qvel))
-            body = problem.view(self._base.body_state()[: len(rows)])
-            views.append({name: getattr(body, name) for name in self._reward.reads})
-            heights.append(body.xpos[:, problem.humanoid.head, 2])
-        return {name: torch.cat([view[name] for view in views]) for name in self._reward.reads}, torch.cat(heights)
+        humanoid, facing = self._base.problem.humanoid, np.array([1.0, 0.0, 0.0, 0.0])
+        body = self._base.bodies(*state_to_qpos(states.double().numpy(), np.zeros(2), facing, humanoid.joint_range))
+        self._followed = {name: getattr(body, name) for name in self._reward.reads}
+        self._head_height = body.xpos[:, humanoid.head, 2]
 
     def perturbation(self, base: EgoPoseEnv) -> Tensor:
         """``[N, nu]`` to add to the policy's mean action in the present state of ``base`` (N environments).
 
-        Called once a frame. Every ``every`` frames it plans anew.
+        Called once a frame. Every ``every`` frames it plans anew, and at the next frame where there was no time for it.
         """
         row = self._row(base.observe())
         if self.path is not None:
             self.path.advance(row, base.body_state()["qpos"])
         if self._age % self.settings.every == 0:
-            self._look_ahead(base)
+            self.plans += 1
+            if not self._look_ahead(base):
+                self.plans_missed += 1
+                self._age = -1
         self._age += 1
         head = torch.as_tensor(base.body_state()["xpos"])[:, base.problem.humanoid.head, 2]
         low = self._head_height[row] - head > self.settings.lost
@@ -184,10 +187,14 @@ class Planner:
         return torch.cat([torch.stack(result), about])
 
     @torch.no_grad()
-    def _look_ahead(self, base: EgoPoseEnv) -> None:
+    def _look_ahead(self, base: EgoPoseEnv) -> bool:
+        """Plan; whether there was time for a round."""
         settings, now = self.settings, base.state_dict()
         candidates = self._candidates()
-        score, returns, low = self._tried(now, candidates)
+        tried = self._tried(now, candidates)
+        if tried is None:
+            return False
+        score, returns, low = tried
         worlds = torch.arange(candidates.shape[1])
         for number in range(settings.rounds - 1 + settings.recovery_rounds):
             recovery_rounds = number - (settings.rounds - 1)
@@ -203,6 +210,9 @@ class Planner:
                     else self._perturbations(settings.samples, wide)
                 )
             tried = self._tried(now, more)
+            if tried is None:
+                self.plans_cut += 1
+                break
             pairs = zip((candidates, score, returns, low), (more, *tried), strict=True)
             candidates, score, returns, low = (torch.cat(pair) for pair in pairs)
         most, change = score.amax(0), (candidates - candidates[1]).square().mean((2, 3))
@@ -212,46 +222,64 @@ class Planner:
         best = torch.where(score[0] >= enough, 0, torch.where(score[1] >= enough, 1, best))
         self._returns = returns[best, worlds]
         self._plan[:, : settings.horizon] = candidates[best, worlds]
+        return True
 
-    def _tried(self, now: Mapping[str, Tensor], candidates: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def _tried(self, now: Mapping[str, Tensor], candidates: Tensor) -> tuple[Tensor, Tensor, Tensor] | None:
         """Simulate ``candidates [K, N, H, nu]`` from the bodies' state ``now``.
 
         Returns:
             Of each candidate ``[K, N]``: all rewards less costs, rewards in the heading frame alone, and by how many
-            metres the head ends below its target.
+            metres the head ends below its target. None where :attr:`late` came between.
         """
-        settings, copies, problem = self.settings, self._base, self._base.problem
+        settings, copies = self.settings, self._base
         self._copy(now)
         seen = Entries(self._env.transform(copies.observe()).items())
-        returns = torch.zeros(copies.batch_size[0])
-        cost, low = torch.zeros_like(returns), torch.zeros_like(returns)
-        before, rate, kept = copies.physics.qvel.copy(), 1.0 / problem.humanoid.control_dt, 1.0
-        for step in range(settings.horizon):
+        count, steps = copies.batch_size[0], settings.horizon
+        qpos = np.empty((steps, count, copies.physics.model.nq))
+        qvel = np.empty((steps + 1, count, copies.physics.model.nv))
+        qvel[0] = copies.physics.qvel
+        rows, numbers, broken = [], [], torch.zeros(count)
+        for step in range(steps):
+            if self.late():
+                return None
             run_parts(self._actor, seen)
-            body, after = copies.try_step(seen[self._action] + candidates[:, :, step].flatten(0, 1))
-            row = self._row(after)
-            followed = SimpleNamespace(**{name: rows.index_select(0, row) for name, rows in self._followed.items()})
-            view = StepView(body, followed, after["episode_step"].squeeze(-1))
-            reward, _ = self._reward(view)
-            if self._path_reward is not None and self.path is not None:
-                followed.place, followed.yaw = self.path.at(row)
-                along, _ = self._path_reward(view)
-                cost -= kept * along.float()
-            low = (self._head_height[row] - body.xpos[:, problem.humanoid.head, 2]).clamp(min=0.0)
-            velocity = body.qvel.numpy()
-            acceleration = torch.from_numpy(np.abs(velocity - before).mean(1) * rate)
-            before = velocity
-            returns += kept * reward.float()
-            cost += kept * (settings.acceleration * acceleration + settings.head * low).float()
-            cost += _BROKEN * after["diverged"].squeeze(-1)
-            kept *= settings.discount
+            after = copies.try_step(seen[self._action] + candidates[:, :, step].flatten(0, 1))
+            qpos[step], qvel[step + 1] = copies.physics.qpos, copies.physics.qvel
+            rows.append(self._row(after))
+            numbers.append(after["episode_step"].squeeze(-1))
+            broken += after["diverged"].squeeze(-1)
             seen = self._env.transform._step(seen, Entries(after))
         run_parts(self._critic, seen)
-        returns += kept * seen["state_value"].squeeze(-1)
-        score, returns, low = (
-            rows.unflatten(0, candidates.shape[:2]) for rows in (returns - cost, returns, low.float())
-        )
+        # Nothing of it changes what the candidates do: it is worked out for all steps at once.
+        reward, cost, low = self._judged(qpos, qvel, torch.cat(rows), torch.cat(numbers))
+        kept = settings.discount ** torch.arange(steps)
+        returns = kept @ reward + settings.discount**steps * seen["state_value"].squeeze(-1)
+        score = returns - kept @ cost - _BROKEN * broken
+        score, returns, low = (part.unflatten(0, candidates.shape[:2]) for part in (score, returns, low[-1]))
         return score, returns, low
+
+    def _judged(self, qpos: Array, qvel: Array, row: Tensor, number: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Reward in the heading frame, cost, and metres that the head is below its target, ``[H, M]`` float32.
+
+        Args:
+            qpos: ``[H, M, nq]`` after each step.
+            qvel: ``[H + 1, M, nv]``, that before the first step too.
+            row: ``[H * M]`` of the target motion.
+            number: ``[H * M]`` steps into the episode.
+        """
+        settings, humanoid = self.settings, self._base.problem.humanoid
+        shape = qpos.shape[:2]
+        body = self._base.bodies(qpos.reshape(-1, qpos.shape[-1]), qvel[1:].reshape(-1, qvel.shape[-1]))
+        followed = SimpleNamespace(**{name: rows.index_select(0, row) for name, rows in self._followed.items()})
+        view = StepView(body, followed, number)
+        reward, _ = self._reward(view)
+        low = (self._head_height[row] - body.xpos[:, humanoid.head, 2]).clamp(min=0.0)
+        changes = torch.from_numpy(np.abs(np.diff(qvel, axis=0)).mean(-1)).flatten() / humanoid.control_dt
+        cost = settings.acceleration * changes + settings.head * low
+        if self._path_reward is not None and self.path is not None:
+            followed.place, followed.yaw = self.path.at(row)
+            cost = cost - self._path_reward(view)[0]
+        return reward.float().view(shape), cost.float().view(shape), low.float().view(shape)
 
     def _copy(self, state: Mapping[str, Tensor]) -> None:
         """Put the copies of every body into the body's state, taken from ``state`` of its environment."""

@@ -33,6 +33,7 @@ def causal_regression(
     source_config: Mapping[str, Any],
     task: Mapping[str, Any],
     lookahead: int,
+    tells_later: bool = False,
 ) -> CausalRegression:
     """The regressor that sees ``lookahead`` frames ahead and no more, for a policy of the group ``task``.
 
@@ -42,10 +43,11 @@ def causal_regression(
         source_config: the groups ``vision`` and ``regressor`` it was trained with.
         task: the run's.
         lookahead: frames.
+        tells_later: see :class:`CausalRegression`.
     """
     smoothing = float(task["action"].get("smoothing", 0.0)) / humanoid.control_dt
     joint_range = torch.as_tensor(humanoid.joint_range)
-    return CausalRegression(regressor, joint_range, lookahead, crossed(source_config), smoothing)
+    return CausalRegression(regressor, joint_range, lookahead, crossed(source_config), smoothing, tells_later)
 
 
 def crossed(source_config: Mapping[str, Any]) -> bool:

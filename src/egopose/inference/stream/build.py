@@ -22,9 +22,13 @@ from egopose.core.config import from_mapping
 from egopose.core.errors import InputError
 from egopose.data.preparation import humanoid_of, store_folder
 from egopose.data.store import TakeStore
+from egopose.envs.problem import Followed, global_frame
+from egopose.envs.test_time import prepare_for_test
 from egopose.humanoid.model import HumanoidModel
 from egopose.inference.causal import CausalRegression
 from egopose.inference.failsafe import FailSafeSettings
+from egopose.inference.planner import Planner
+from egopose.inference.planner_settings import planned_threshold, planner_settings
 from egopose.inference.stream import live_forecasts, loop
 from egopose.inference.stream.forecasting import ForecastThread
 from egopose.inference.stream.frame_features import FrameFeatures
@@ -46,6 +50,8 @@ from egopose.vision.flow import FlowConfig
 from egopose.vision.lens import Camera
 
 _CONFIG = "conf/stream.yaml"
+#: Frames of a live body's take: the present one, the next, and look-aheads or horizons of up to a second.
+ROWS = 32
 
 
 @dataclass(frozen=True)
@@ -56,7 +62,8 @@ class Trained:
         humanoid: the run's.
         regressor: in eval mode.
         source_config: the groups ``vision`` and ``regressor``.
-        env: one world, on a take of two frames.
+        env: one world, on a take of :data:`ROWS` frames.
+        copies: of that environment, for a planner: of so many worlds, with so many threads of physics.
         actor, critic: in eval mode.
         config: of the run, resolved.
     """
@@ -65,6 +72,7 @@ class Trained:
     regressor: StateRegressor
     source_config: Mapping[str, Any]
     env: TransformedEnv
+    copies: Callable[[int, int], TransformedEnv]
     actor: TensorDictModuleBase
     critic: TensorDictModuleBase
     config: Mapping[str, Any]
@@ -80,9 +88,12 @@ def load_trained(checkpoint: str, which: str) -> Trained:
     config = read_json(folder, "config")
     humanoid = humanoid_of(config)
     regressor, source_config = load_regressor(run_folder(folder) / "regressor")
-    agent = load_agent(folder, still_frames(humanoid, regressor, source_config))
-    env = agent.make_env("test", num_envs=1, threads=1, whole_fragments=True, falls_end=False)
-    return Trained(humanoid, regressor, source_config, env, agent.actor, agent.critic, config)
+    agent = load_agent(folder, still_frames(humanoid, regressor, source_config, ROWS))
+
+    def made(worlds: int, threads: int) -> TransformedEnv:
+        return agent.make_env("test", num_envs=worlds, threads=threads, whole_fragments=True, falls_end=False)
+
+    return Trained(humanoid, regressor, source_config, made(1, 1), made, agent.actor, agent.critic, config)
 
 
 @dataclass(frozen=True)
@@ -158,12 +169,16 @@ def load_forecaster(values: Mapping[str, Any], trained: Trained) -> Forecaster |
 
 
 def still_frames(
-    humanoid: HumanoidModel, regressor: StateRegressor, source_config: Mapping[str, Any], frames: int = 2
+    humanoid: HumanoidModel, regressor: StateRegressor, source_config: Mapping[str, Any], frames: int
 ) -> Dataset:
-    """The dataset of a take of still frames: what an environment needs to be made before anything is seen."""
+    """The dataset of a take of still frames: what an environment needs to be made before anything is seen.
+
+    Its path stands still as well.
+    """
     size = int(source_config["vision"]["flow"]["stored_size"])
     still = np.zeros((frames, planes_of(source_config["regressor"]), size, size), np.float16)
-    return video_dataset(humanoid, seen_in(humanoid, regressor, still, source_config), "stream")[0]
+    seen, path = seen_in(humanoid, regressor, still, source_config), torch.zeros(frames, 3, dtype=torch.float64)
+    return video_dataset(humanoid, seen, "stream", path)[0]
 
 
 def build_loop(
@@ -174,18 +189,39 @@ def build_loop(
     Raises:
         InputError: a setting is wrong.
     """
-    for name, least in (("threads", 1), ("opencv_threads", 1), ("lookahead", 0), ("bridge", 0), ("latency_frames", 1)):
+    least_of = {
+        "threads": 1,
+        "opencv_threads": 1,
+        "physics_threads": 1,
+        "lookahead": 0,
+        "bridge": 0,
+        "latency_frames": 1,
+    }
+    for name, least in least_of.items():
         if not isinstance(values[name], int) or values[name] < least:
             raise InputError(_CONFIG, name, f"must be a whole number of at least {least}, not {values[name]!r}")
     torch.set_num_threads(values["threads"])
     cv2.setNumThreads(values["opencv_threads"])
-    failsafe = from_mapping(FailSafeSettings, values["failsafe"], f"{_CONFIG}: failsafe").for_run(trained.config)
-    limits = {name: values[name] for name in ("seconds", "bridge")}
+    planned = planner_settings(values["planner"])
+    failsafe = from_mapping(FailSafeSettings, values["failsafe"], f"{_CONFIG}: failsafe")
+    failsafe = failsafe.for_run(trained.config, planned_threshold(planned))
+    limits = {name: values[name] for name in ("seconds", "bridge", "plan_until")}
+    if values["pace"] == "every":  # no frame is late
+        limits["plan_until"] = None
     settings = from_mapping(LoopSettings, limits, _CONFIG)
     flow = FlowConfig(**dict(trained.source_config["vision"]["flow"]))
     camera = Camera.from_mapping(values["camera"], "camera")
     rate = 1.0 / trained.humanoid.control_dt
     latency = LatencyTable(loop.STAGES, values["latency_frames"])
+    copies = None if planned is None else trained.copies(planned.samples, values["physics_threads"])
+
+    def planner() -> Planner | None:
+        if planned is None or copies is None:
+            return None
+        prepare_for_test(copies, trained.actor, trained.critic)
+        return Planner(
+            copies, trained.actor, trained.critic, planned, Followed(trained.env.base_env.problem.states, global_frame)
+        )
 
     def parts(lap: Callable[[str], None]) -> tuple[FrameFeatures, CausalRegression, LiveBody]:
         """As at the start: nothing seen yet."""
@@ -194,8 +230,10 @@ def build_loop(
             FrameFeatures(
                 trained.regressor, flow, camera, rate, load_body_part_estimator_of(trained.source_config["regressor"])
             ),
-            causal_regression(trained.humanoid, trained.regressor, trained.source_config, task, lookahead),
-            LiveBody(trained.env, trained.actor, trained.critic, failsafe, lap),
+            causal_regression(
+                trained.humanoid, trained.regressor, trained.source_config, task, lookahead, planned is not None
+            ),
+            LiveBody(trained.env, trained.actor, trained.critic, failsafe, lap, planner(), copies),
         )
 
     warm_up(*parts(lambda stage: None))
@@ -298,7 +336,7 @@ def settle_memory() -> None:
 def print_report(status: Mapping[str, Any]) -> None:
     """Counts and the latency table, to standard output."""
     counts = ["poses", "used", "dropped", "surplus", "bridged", "lost", "resets", "reconnects"]
-    counts += ["forecasts", "forecasts_skipped"]
+    counts += ["plans", "plans_cut", "plans_missed", "forecasts", "forecasts_skipped"]
     words = (f"{status[name]} {name.replace('_', ' ')}" for name in counts)
     print(f"{status['seconds']:.1f} s, " + ", ".join(words))
     print(f"{'stage':16s} {'p50 ms':>8s} {'p95 ms':>8s} {'p99 ms':>8s}")

@@ -9,6 +9,7 @@ Forecasts have a thread of their own (:class:`ForecastThread`), which is handed 
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 from collections.abc import Callable
@@ -26,7 +27,7 @@ from egopose.inference.stream.memory import MemoryTrace
 from egopose.inference.stream.newest_frame import Captured, NewestFrame
 
 #: In the order in which a frame passes them.
-STAGES = ("flow", "encoder", "context", "policy", "physics", "output")
+STAGES = ("flow", "encoder", "context", "policy", "planner", "physics", "output")
 
 #: Told a pose and how late it is (ms, from its last frame's arrival).
 PoseSink = Callable[[LivePose, float], None]
@@ -44,10 +45,12 @@ class LoopSettings:
     Args:
         seconds: stop after this long; None for the source's end.
         bridge: control frames without a picture that are filled in at most.
+        plan_until: s from a picture's arrival at which a planner must stop; None for never.
     """
 
     seconds: float | None
     bridge: int
+    plan_until: float | None = None
 
 
 @dataclass
@@ -149,9 +152,10 @@ class LiveLoop:
         return self.status()
 
     def status(self, last: int | None = None) -> dict[str, Any]:
-        """``seconds`` since the start, the counts, ``dropped`` (late pictures), ``reconnects`` and ``broken`` of the
-        source, ``forecasts`` and ``forecasts_skipped``, ``fps`` (pictures used a second), ``stages`` (of the ``last``
-        frames, see :meth:`LatencyTable.percentiles_ms`) and memory (see :meth:`MemoryTrace.report`)."""
+        """``seconds`` since the start, the counts, those of :attr:`LiveBody.plans`, ``dropped`` (late pictures),
+        ``reconnects`` and ``broken`` of the source, ``forecasts`` and ``forecasts_skipped``, ``fps`` (pictures used a
+        second), ``stages`` (of the ``last`` frames, see :meth:`LatencyTable.percentiles_ms`) and memory (see
+        :meth:`MemoryTrace.report`)."""
         seconds = time.perf_counter() - self._began
         beside = self._forecasts
         stages = self.latency.percentiles_ms(last)
@@ -160,6 +164,7 @@ class LiveLoop:
         return {
             "seconds": seconds,
             **vars(self.counts),
+            **self._body.plans,
             "dropped": self._newest.dropped,
             "reconnects": self._newest.reconnects,
             "broken": self._newest.broken,
@@ -190,6 +195,8 @@ class LiveLoop:
         latency.lap("flow")
         features = self._sight.features(flow)
         latency.lap("encoder")
+        until = self._settings.plan_until
+        deadline = math.inf if until is None else captured.arrived + until
         for _ in range(steps):
             self._frame += 1
             if self._forecasts is not None:
@@ -197,7 +204,7 @@ class LiveLoop:
             seen = self._regression.push(self._frame, features)
             latency.lap("context")
             if seen is not None:
-                self._give(self._body.advance(seen), on_pose, 1e3 * (time.perf_counter() - captured.arrived))
+                self._give(self._body.advance(seen, deadline), on_pose, 1e3 * (time.perf_counter() - captured.arrived))
                 latency.lap("output")
         latency.end(captured.arrived)
 
