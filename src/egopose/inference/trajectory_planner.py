@@ -201,7 +201,7 @@ class TrajectoryPlanner:
         for _ in range(settings.horizon):
             run_parts(self._actor, seen)
             ctrl.append(self._controls(copies, seen[self._action]))
-            _, after = copies.try_step(seen[self._action])
+            after = copies.try_step(seen[self._action])
             rows.append(self._row(after))
             qpos.append(copies.physics.qpos.copy())
             qvel.append(copies.physics.qvel.copy())

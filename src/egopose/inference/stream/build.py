@@ -28,7 +28,8 @@ from egopose.humanoid.model import HumanoidModel
 from egopose.inference.causal import CausalRegression
 from egopose.inference.failsafe import FailSafeSettings
 from egopose.inference.planner import Planner
-from egopose.inference.planner_settings import planned_threshold, planner_settings
+from egopose.inference.planner_settings import planner_settings
+from egopose.inference.planners import planned_threshold
 from egopose.inference.stream import live_forecasts, loop
 from egopose.inference.stream.forecasting import ForecastThread
 from egopose.inference.stream.frame_features import FrameFeatures
