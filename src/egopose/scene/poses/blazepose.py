@@ -19,8 +19,8 @@ TURNS = (0, 1, 2, 3)
 _LOOK_EVERY = 10
 #: A reading that scores less is nobody; below the second, the whole picture is looked over again at once.
 _LEAST, _DOUBTFUL = 0.5, 0.8
-#: Readings of a frame whose regions are read again in the next one.
-_CARRIED = 2
+#: People of a frame whose regions are read again in the next one.
+_CARRIED = 4
 
 
 class BlazePose:
@@ -49,19 +49,21 @@ class BlazePose:
         """
         readings: list[list[Reading]] = []
         carried: list[Reading] = []
+        people = 1
         shape: tuple[int, ...] = ()
         for t, frame in enumerate(frames):
             shape = shape or frame.shape
             if frame.shape != shape or t >= MAX_FRAMES:
                 raise InputError("poses", f"frame {t}", f"{frame.shape}; frames of one size, at most {MAX_FRAMES}")
-            doubtful = not carried or carried[0].score < _DOUBTFUL
+            doubtful = len(carried) < people or min(r.score for r in carried) < _DOUBTFUL
+            people = max(len(carried), 1)
             regions = [reading.region for reading in carried]
             if doubtful or t % _LOOK_EVERY == 0:
                 regions += self._look(frame)
             found = [self._networks.read(frame, region) for region in _distinct(regions)]
             found = [reading for reading in found if reading.score >= _LEAST]
             readings.append(found)
-            carried = sorted(found, key=lambda r: -float(r.confidence.mean()))[:_CARRIED]
+            carried = _people(found)
         if not any(readings):
             raise InputError("poses", "frames", f"no person was found in {len(readings)} frames")
         return _track(readings, fps, (shape[1], shape[0]), self._at)
@@ -97,6 +99,15 @@ def _turned_back(region: Region, turns: int, width: int, height: int) -> Region:
     return Region(*places[turns % 4], region.side, region.turn + 0.5 * np.pi * turns, region.score)
 
 
+def _people(found: list[Reading]) -> list[Reading]:
+    """The best reading of each person of a frame, the most confident first: several regions may show one person."""
+    out: list[Reading] = []
+    for reading in sorted(found, key=lambda r: -float(r.confidence.mean())):
+        if all(_apart(reading.region, other.region, turned=False) for other in out) and len(out) < _CARRIED:
+            out.append(reading)
+    return out
+
+
 def _distinct(regions: list[Region]) -> list[Region]:
     """Regions that differ: each is read at some cost."""
     out: list[Region] = []
@@ -106,7 +117,9 @@ def _distinct(regions: list[Region]) -> list[Region]:
     return out
 
 
-def _apart(a: Region, b: Region) -> bool:
+def _apart(a: Region, b: Region, turned: bool = True) -> bool:
+    """Whether two regions are of different people or, where ``turned``, may be read differently."""
     side = max(a.side, b.side)
     turn = abs((a.turn - b.turn + np.pi) % (2.0 * np.pi) - np.pi)
-    return bool(np.hypot(a.x - b.x, a.y - b.y) > 0.15 * side or min(a.side, b.side) < 0.75 * side or turn > 0.4)
+    elsewhere = bool(np.hypot(a.x - b.x, a.y - b.y) > 0.15 * side or min(a.side, b.side) < 0.75 * side)
+    return elsewhere or (turned and turn > 0.4)

@@ -185,5 +185,5 @@ def _refined(places: Array, heat: np.ndarray) -> Array:
         if window.max() >= _LEAST_HEAT:
             rows, columns = np.indices(window.shape)
             weighted = np.array([(columns * window).sum(), (rows * window).sum()]) / window.sum()
-            out[k] = (weighted + [left, top]) * (_SIDE / _HEAT)
+            out[k] = (weighted + np.array([left, top])) * (_SIDE / _HEAT)
     return out

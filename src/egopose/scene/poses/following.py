@@ -15,10 +15,11 @@ from egopose.motion.rotations import Array
 
 #: Seconds over which a person who was not found is still the same one.
 LONGEST_GAP = 2.0
-#: A person's keypoints move at most by this in a second, in body heights: a sprinter's do 5 m/s.
-_FASTEST = 5.0
-#: In heights: two frames differ by this much anyway, the noise of keypoints.
-_NOISE = 0.15
+#: In body heights: how far keypoints may lie from where the person would be at the same speed. By noise, for each
+#: second (gravity alone makes 0.7 of the first half), and at most: whoever turns up elsewhere may be anybody.
+_NOISE, _EACH_SECOND, _FURTHEST = 0.15, 2.0, 0.7
+#: Of two sights of one person the smaller is at least this much of the larger one: crouching halves a box.
+_LEAST_SIZE = 0.35
 #: How much a move of one height counts against a reading of full confidence.
 _STEADINESS = 2.0
 #: Keypoints below this confidence say nothing.
@@ -59,6 +60,7 @@ def follow(frames: Sequence[Sequence[Candidate]], fps: float, at: tuple[float, f
     longest = max(1, round(LONGEST_GAP * fps))
     largest = max((c.height for candidates in frames for c in candidates), default=1.0)
     worth = [np.array([_worth(c, largest) for c in candidates]) for candidates in frames]
+    speeds = [_speeds(frames, t) for t in range(len(frames))]
     first = next((t for t, candidates in enumerate(frames) if candidates), None)
     if at is not None and first is not None:
         away = [float(np.hypot(*(_middle(c) - np.array(at)))) for c in frames[first]]
@@ -71,7 +73,7 @@ def follow(frames: Sequence[Sequence[Candidate]], fps: float, at: tuple[float, f
         for gap in range(1, min(longest, t) + 1):
             for j, earlier in enumerate(frames[t - gap]):
                 for i, candidate in enumerate(candidates):
-                    cost = _jump(earlier, candidate, gap / fps)
+                    cost = _jump(earlier, candidate, gap * speeds[t - gap][j], gap / fps)
                     if (sum_ := best[t - gap][j] - cost + worth[t][i]) > total[i]:
                         total[i], links[i] = sum_, (t - gap, j)
             if gap == 1 and frames[t - 1] and all(link[0] == t - 1 for link in links):
@@ -99,11 +101,29 @@ def _middle(candidate: Candidate) -> Array:
     return points.mean(axis=0) if len(points) else np.full(2, np.inf)
 
 
-def _jump(a: Candidate, b: Candidate, seconds: float) -> float:
-    """What it costs that ``b`` be the person of ``a``, so many seconds later; infinite where it cannot be."""
+def _speeds(frames: Sequence[Sequence[Candidate]], t: int) -> list[Array]:
+    """``[2]`` px a frame of each candidate of frame t, by whoever stood next to it in the frame before."""
+    out = []
+    for candidate in frames[t]:
+        here, nearest = _middle(candidate), np.zeros(2)
+        others = frames[t - 1] if t else ()
+        moves = [here - _middle(other) for other in others]
+        near = [move for move in moves if np.isfinite(move).all() and np.hypot(*move) < _NOISE * candidate.height]
+        if near:
+            nearest = min(near, key=lambda move: float(np.hypot(*move)))
+        out.append(nearest)
+    return out
+
+
+def _jump(a: Candidate, b: Candidate, move: Array, seconds: float) -> float:
+    """What it costs that ``b`` be the person of ``a``, so many seconds later; infinite where it cannot be.
+
+    ``move [2]`` px is the way at the speed that ``a`` had; who stood still is as likely.
+    """
     both = a.seen & b.seen
-    if both.sum() < 3:
+    height, smaller = max(a.height, b.height), min(a.height, b.height)
+    if both.sum() < 3 or smaller < _LEAST_SIZE * height:
         return np.inf
-    height = max(a.height, b.height)
-    moved = float(np.median(np.linalg.norm(a.pixels[both] - b.pixels[both], axis=1))) / height
-    return _STEADINESS * moved if moved <= _NOISE + _FASTEST * seconds else np.inf
+    way = b.pixels[both] - a.pixels[both]
+    away = min(float(np.median(np.linalg.norm(way - guess, axis=1))) for guess in (move, np.zeros(2))) / height
+    return _STEADINESS * away if away <= min(_NOISE + _EACH_SECOND * seconds, _FURTHEST) else np.inf

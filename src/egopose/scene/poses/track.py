@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,7 +30,7 @@ class PoseTrack:
     Args:
         schema: the layout of the ``K`` keypoints.
         pixels: ``[T, K, 2]`` px, x right and y down from the picture's upper left corner; NaN where unknown.
-        confidence: ``[T, K]`` from 0 to 1; 0 where unknown.
+        confidence: ``[T, K]`` from 0 to 1; 0 where neither pixels nor positions are known.
         fps: frames per second.
         image_size: width and height, px; None for a source without pictures.
         positions: ``[T, K, 3]`` m, NaN where unknown, or None. A camera's are relative to the middle of the hips.
@@ -113,13 +114,13 @@ class PoseTrack:
 
     def save(self, path: str | Path) -> None:
         """Write an ``.npz`` of plain arrays that :func:`load_track` reads."""
-        arrays = {name: getattr(self, name) for name in _ARRAYS if getattr(self, name) is not None}
+        arrays: dict[str, Any] = {name: getattr(self, name) for name in _ARRAYS if getattr(self, name) is not None}
         size = np.array(self.image_size if self.image_size is not None else (0, 0))
         layout = np.frombuffer(self.schema.name.encode(), dtype=np.uint8)
         notes = np.frombuffer("\n".join((self.person, *self.notes)).encode(), dtype=np.uint8)
-        numbers = {"fps": np.array(self.fps), "image_size": size, "axes": np.array(AXES.index(self.axes))}
+        arrays |= {"fps": np.array(self.fps), "image_size": size, "axes": np.array(AXES.index(self.axes))}
         with Path(path).open("wb") as stream:
-            np.savez_compressed(stream, **arrays, **numbers, pose_layout=layout, notes=notes)
+            np.savez_compressed(stream, **arrays, pose_layout=layout, notes=notes)
 
 
 def load_track(path: str | Path) -> PoseTrack:
@@ -147,9 +148,11 @@ def load_track(path: str | Path) -> PoseTrack:
             (width, height) if width else None,
             arrays["positions"].astype(np.float64) if "positions" in arrays else None,
             AXES[int(arrays.get("axes", np.zeros(())))],
-            *(arrays[name].astype(kind) for name, kind in (("filled", bool), ("swapped", bool), ("weights", float))),
-            person=person,
-            notes=tuple(notes),
+            arrays["filled"].astype(bool),
+            arrays["swapped"].astype(bool),
+            arrays["weights"].astype(np.float64),
+            person,
+            tuple(notes),
         )
     except (ValueError, KeyError, IndexError, TypeError) as error:
         raise InputError(path, "arrays", f"do not make a track of poses: {error}"[:200]) from None
