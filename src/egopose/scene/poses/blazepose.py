@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import replace
 
 import numpy as np
 
@@ -19,6 +20,10 @@ TURNS = (0, 1, 2, 3)
 _LOOK_EVERY = 10
 #: A reading that scores less is nobody; below the second, the whole picture is looked over again at once.
 _LEAST, _DOUBTFUL = 0.5, 0.8
+#: Who was lost is looked for this long (s), this many of them, within this many sides of the region they were in.
+_SEARCH, _SEARCHED, _NEARBY = 1.5, 2, 1.5
+#: A picture smaller than this (px) shows nobody.
+_LEAST_SIDE = 16
 #: People of a frame whose regions are read again in the next one.
 _CARRIED = 4
 
@@ -49,32 +54,45 @@ class BlazePose:
         """
         readings: list[list[Reading]] = []
         carried: list[Reading] = []
-        people = 1
+        lost: list[tuple[Region, int]] = []
         shape: tuple[int, ...] = ()
+        longest = _SEARCH * fps
         for t, frame in enumerate(frames):
             shape = shape or frame.shape
             if frame.shape != shape or t >= MAX_FRAMES:
                 raise InputError("poses", f"frame {t}", f"{frame.shape}; frames of one size, at most {MAX_FRAMES}")
-            doubtful = len(carried) < people or min(r.score for r in carried) < _DOUBTFUL
-            people = max(len(carried), 1)
+            doubtful = not carried or min(r.score for r in carried) < _DOUBTFUL
             regions = [reading.region for reading in carried]
             if doubtful or t % _LOOK_EVERY == 0:
                 regions += self._look(frame)
+            for region, _ in lost:
+                regions += self._look(frame, region)
             found = [self._networks.read(frame, region) for region in _distinct(regions)]
             found = [reading for reading in found if reading.score >= _LEAST]
             readings.append(found)
-            carried = _people(found)
+            before, carried = carried, _people(found)
+            lost += [(reading.region, t) for reading in before]
+            lost = [(r, since) for r, since in lost if t - since <= longest and not _is_among(r, carried)]
+            lost = sorted(lost, key=lambda one: -one[0].side)[:_SEARCHED]
         if not any(readings):
             raise InputError("poses", "frames", f"no person was found in {len(readings)} frames")
         return _track(readings, fps, (shape[1], shape[0]), self._at)
 
-    def _look(self, frame: Frame) -> list[Region]:
-        """People in the whole picture, upright and in its other turns."""
+    def _look(self, frame: Frame, around: Region | None = None) -> list[Region]:
+        """People in the whole picture, or near where one was: upright and in the picture's other turns."""
+        left, top = 0, 0
+        if around is not None:
+            # In a part of the picture a small person is seen larger.
+            reach = _NEARBY * around.side
+            left, top = max(0, int(around.x - reach)), max(0, int(around.y - reach))
+            frame = frame[top : max(0, int(around.y + reach)), left : max(0, int(around.x + reach))]
+        if min(frame.shape[:2]) < _LEAST_SIDE:
+            return []
         out = []
         for turns in self._turns:
             turned = np.ascontiguousarray(np.rot90(frame, turns))
             out += [_turned_back(r, turns, frame.shape[1], frame.shape[0]) for r in self._networks.people(turned)]
-        return out
+        return [replace(region, x=region.x + left, y=region.y + top) for region in out]
 
 
 def _track(
@@ -106,6 +124,14 @@ def _people(found: list[Reading]) -> list[Reading]:
         if all(_apart(reading.region, other.region, turned=False) for other in out) and len(out) < _CARRIED:
             out.append(reading)
     return out
+
+
+def _is_among(region: Region, people: list[Reading]) -> bool:
+    """Whether the person of a region is one of those found: somebody of like size is near its middle."""
+    return any(
+        np.hypot(region.x - other.region.x, region.y - other.region.y) < 0.5 * max(region.side, other.region.side)
+        for other in people
+    )
 
 
 def _distinct(regions: list[Region]) -> list[Region]:
