@@ -17,7 +17,7 @@ from egopose.vision.video import Frame
 
 pytest.importorskip("ai_edge_litert", reason="the extra 'poses' is not installed")
 
-from egopose.scene.poses.blazepose import BlazePose  # noqa: E402
+from egopose.scene.poses.blazepose import BlazePose
 
 PICTURES = Path(__file__).parent / "pictures"
 

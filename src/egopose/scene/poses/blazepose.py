@@ -20,6 +20,8 @@ TURNS = (0, 1, 2, 3)
 _LOOK_EVERY = 10
 #: A reading that scores less is nobody; below the second, the whole picture is looked over again at once.
 _LEAST, _DOUBTFUL = 0.5, 0.8
+#: Mean confidence of a person who was found well.
+_CLEAR = 0.6
 #: Who was lost is looked for this long (s), this many of them, within this many sides of the region they were in.
 _SEARCH, _SEARCHED, _NEARBY = 1.5, 2, 1.5
 #: A picture smaller than this (px) shows nobody.
@@ -65,18 +67,23 @@ class BlazePose:
             regions = [reading.region for reading in carried]
             if doubtful or t % _LOOK_EVERY == 0:
                 regions += self._look(frame)
+            found = self._read(frame, regions)
+            lost += [(reading.region, t) for reading in carried if reading.confidence.mean() >= _CLEAR]
+            lost = [(r, since) for r, since in lost if t - since <= longest and not _is_among(r, found)]
+            lost = sorted(lost, key=lambda one: -one[1])[:_SEARCHED]
             for region, _ in lost:
-                regions += self._look(frame, region)
-            found = [self._networks.read(frame, region) for region in _distinct(regions)]
-            found = [reading for reading in found if reading.score >= _LEAST]
+                if not _is_among(region, found):
+                    found += self._read(frame, self._look(frame, region))
             readings.append(found)
-            before, carried = carried, _people(found)
-            lost += [(reading.region, t) for reading in before]
-            lost = [(r, since) for r, since in lost if t - since <= longest and not _is_among(r, carried)]
-            lost = sorted(lost, key=lambda one: -one[0].side)[:_SEARCHED]
+            carried = _people(found)
         if not any(readings):
             raise InputError("poses", "frames", f"no person was found in {len(readings)} frames")
         return _track(readings, fps, (shape[1], shape[0]), self._at)
+
+    def _read(self, frame: Frame, regions: list[Region]) -> list[Reading]:
+        """Readings of the regions in which there is a person."""
+        found = [self._networks.read(frame, region) for region in _distinct(regions)]
+        return [reading for reading in found if reading.score >= _LEAST]
 
     def _look(self, frame: Frame, around: Region | None = None) -> list[Region]:
         """People in the whole picture, or near where one was: upright and in the picture's other turns."""
@@ -126,11 +133,11 @@ def _people(found: list[Reading]) -> list[Reading]:
     return out
 
 
-def _is_among(region: Region, people: list[Reading]) -> bool:
-    """Whether the person of a region is one of those found: somebody of like size is near its middle."""
+def _is_among(region: Region, found: list[Reading]) -> bool:
+    """Whether the person of a region was found well: like in size, near its middle."""
     return any(
-        np.hypot(region.x - other.region.x, region.y - other.region.y) < 0.5 * max(region.side, other.region.side)
-        for other in people
+        not _apart(region, reading.region, turned=False, near=0.4, like=0.6) and reading.confidence.mean() >= _CLEAR
+        for reading in found
     )
 
 
@@ -143,9 +150,9 @@ def _distinct(regions: list[Region]) -> list[Region]:
     return out
 
 
-def _apart(a: Region, b: Region, turned: bool = True) -> bool:
+def _apart(a: Region, b: Region, turned: bool = True, near: float = 0.15, like: float = 0.75) -> bool:
     """Whether two regions are of different people or, where ``turned``, may be read differently."""
     side = max(a.side, b.side)
     turn = abs((a.turn - b.turn + np.pi) % (2.0 * np.pi) - np.pi)
-    elsewhere = bool(np.hypot(a.x - b.x, a.y - b.y) > 0.15 * side or min(a.side, b.side) < 0.75 * side)
+    elsewhere = bool(np.hypot(a.x - b.x, a.y - b.y) > near * side or min(a.side, b.side) < like * side)
     return elsewhere or (turned and turn > 0.4)
