@@ -1,1 +1,1 @@
-"""scene"""
+"""From a video of a moving camera: poses, the camera, and the scene."""

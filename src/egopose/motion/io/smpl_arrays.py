@@ -1,7 +1,8 @@
 """A body's turns and place out of the arrays that AMASS, SMPL-X's own tools and pose estimators write.
 
 Each of them has the same numbers under other names: AMASS one array ``poses`` or (SMPL-X) ``root_orient`` and
-``pose_body``, the ``smplx`` package and estimators ``global_orient``, ``body_pose`` and ``transl``.
+``pose_body``, the ``smplx`` package and estimators ``global_orient``, ``body_pose`` and ``transl``, WHAM
+``pose_world`` and ``trans_world``.
 """
 
 from __future__ import annotations
@@ -20,9 +21,9 @@ from egopose.motion.rotations import Array
 #: Joints of the body that SMPL, SMPL-H and SMPL-X share; the pelvis is the first.
 SHARED_JOINTS = 22
 
-_WHOLE = ("poses", "pose", "fullpose", "full_pose")
+_WHOLE = ("pose_world", "poses", "pose", "fullpose", "full_pose")
 _ROOT, _BODY = ("root_orient", "global_orient"), ("pose_body", "body_pose")
-_PLACE = ("trans", "transl", "translation")
+_PLACE = ("trans_world", "trans", "transl", "translation")
 _RATES = ("mocap_framerate", "mocap_frame_rate", "fps", "framerate", "frame_rate")
 
 #: Joints in one array -> the body model.

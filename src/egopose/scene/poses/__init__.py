@@ -1,0 +1,1 @@
+"""Poses of a filmed person: readers, estimators, and what mends them."""
