@@ -194,8 +194,8 @@ def _step(qpos: Array, normal: Array, gradient: Array, squared: Array, limits: A
         damped[frames, held, :] = 0.0
         damped[frames, :, held] = 0.0
         damped[frames, held, held] = 1.0
-    step: Array = np.linalg.solve(damped, pull[..., None])[..., 0]
-    return moved(qpos, step, limits)
+    step = np.linalg.solve(damped, pull[..., None])[..., 0]
+    return moved(qpos, np.asarray(step, dtype=np.float64), limits)
 
 
 def moved(qpos: Array, step: Array, limits: Array | None) -> Array:
