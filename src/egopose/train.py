@@ -1,8 +1,9 @@
 """``python -m egopose.train [group=choice] [key=value] [resume=RUN_DIR] [--multirun]``: train a policy.
 
 With ``--config-name body_parts`` it trains what finds the wearer's body parts in a picture (docs/howto-body-parts.md),
-with ``--config-name head_signal`` what reads states from a camera's motion (docs/howto-estimate.md), and with
-``--config-name tracker`` a policy that follows any motion, before PPO goes on with it.
+with ``--config-name head_signal`` what reads states from a camera's motion (docs/howto-estimate.md), with
+``--config-name contacts`` what tells which foot touches something, and with ``--config-name tracker`` a policy that
+follows any motion, before PPO goes on with it.
 """
 
 from __future__ import annotations
@@ -27,6 +28,7 @@ register_resolvers()
 def hydra_main(config: DictConfig) -> float:
     """One job of Hydra's: a new run, one resumed, or one of a sweep."""
     from egopose.pipeline.body_parts import train_body_parts
+    from egopose.pipeline.contacts import train_contacts
     from egopose.pipeline.head_signal import train_head_signal
     from egopose.pipeline.tracker import train_tracker
     from egopose.pipeline.training import STOPPING, start_run
@@ -35,7 +37,8 @@ def hydra_main(config: DictConfig) -> float:
     # MuJoCo warns here of every world that diverges; they are counted, and their last states kept.
     logging.getLogger("absl").setLevel(logging.ERROR)
     try:
-        others = {"body_parts": train_body_parts, "head_signal": train_head_signal, "tracker": train_tracker}
+        others = {"body_parts": train_body_parts, "head_signal": train_head_signal}
+        others |= {"contacts": train_contacts, "tracker": train_tracker}
         if state.job.config_name in others:
             others[state.job.config_name](resolved(config))
             return 0.0

@@ -21,7 +21,7 @@ from egopose.models.pose_regression import integrated_path, state_to_qpos
 from egopose.models.regressor import StateRegressor
 from egopose.motion import rotations as rot
 from egopose.motion.rotations import Array
-from egopose.pipeline import head_signal as pipeline
+from egopose.pipeline import mocap_sources
 from egopose.pipeline.head_signal import make_head_signal_regressor, motions_of, train_head_signal
 from egopose.training.head_signal_figures import held_out_figures
 from egopose.training.head_signal_regressor import (
@@ -186,7 +186,7 @@ def small(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
     """The command's configuration with one source, two short embedded clips; one of them is a test person's."""
     composed = compose_config("train", short_clips(tmp_path))
     composed["data"]["split"] = {"kind": "subject", "test_subjects": ["turn"], "shortest": 8, "subjects": None}
-    monkeypatch.setattr(pipeline, "compose_config", lambda name, words: composed)
+    monkeypatch.setattr(mocap_sources, "compose_config", lambda name, words: composed)
     training = [f"training.{name}={list(v) if isinstance(v, tuple) else v!s}" for name, v in TINY.items()]
     source = [f"sources.cmu6={tmp_path / 'mocap'}", "whole=[]", f"out={tmp_path / 'regressor'}"]
     return compose_config("head_signal", [*source, *training])

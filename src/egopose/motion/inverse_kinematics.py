@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
@@ -21,7 +21,7 @@ class Targets:
         point_joint: ``[K]`` joint index each point hangs on.
         point_offset: ``[K, 3]`` of the point in that joint's frame, metres.
         positions: ``[T, K, 3]`` where the points should be, metres.
-        position_weight: ``[K]``, 1 for a point that counts fully.
+        position_weight: ``[K]``, or ``[T, K]`` where frames differ; 1 for a point that counts fully, 0 for one unseen.
         frame_joint: ``[M]`` joints whose orientation counts.
         orientations: ``[T, M, 4]`` quaternions.
         orientation_weight: ``[M]`` metres per radian: what a radian is worth against a metre.
@@ -34,6 +34,16 @@ class Targets:
     frame_joint: np.ndarray
     orientations: Array
     orientation_weight: Array
+
+    def at(self, frames: slice | np.ndarray) -> Targets:
+        """Those of some frames."""
+        shared = self.position_weight.ndim == 1
+        return replace(
+            self,
+            positions=self.positions[frames],
+            position_weight=self.position_weight if shared else self.position_weight[frames],
+            orientations=self.orientations[frames],
+        )
 
 
 @lru_cache(maxsize=32)
@@ -89,7 +99,7 @@ def solve(
         ``[T, nq]``.
     """
     chunks = [
-        _solve(skeleton, start[i : i + 512], _part(targets, slice(i, i + 512)), limits, iterations, damping, stay)
+        _solve(skeleton, start[i : i + 512], targets.at(slice(i, i + 512)), limits, iterations, damping, stay)
         for i in range(0, len(start), 512)
     ]
     return np.concatenate(chunks)
@@ -109,9 +119,8 @@ def solve_in_time(skeleton: Skeleton, start: Array, targets: Targets, limits: Ar
         bad, neighbour = bad[inside], neighbour[inside]
         if not len(bad):
             break
-        moved = qpos[neighbour].copy()
-        again = solve(skeleton, moved, _part(targets, bad), limits)
-        new_cost = _cost(skeleton, again, _part(targets, bad))
+        again = solve(skeleton, qpos[neighbour], targets.at(bad), limits)
+        new_cost = _cost(skeleton, again, targets.at(bad))
         better = new_cost < cost[bad]
         qpos[bad[better]], cost[bad[better]] = again[better], new_cost[better]
     return qpos
@@ -128,20 +137,8 @@ def _cost(skeleton: Skeleton, qpos: Array, targets: Targets) -> Array:
     positions, quats = forward_kinematics(skeleton, qpos)
     points = positions[:, targets.point_joint] + rot.rotate(quats[:, targets.point_joint], targets.point_offset[None])
     off = rot.to_rotvec(rot.multiply(targets.orientations, rot.conjugate(quats[:, targets.frame_joint])))
-    return np.sum(((targets.positions - points) * targets.position_weight[:, None]) ** 2, axis=(1, 2)) + np.sum(
+    return np.sum(((targets.positions - points) * targets.position_weight[..., None]) ** 2, axis=(1, 2)) + np.sum(
         (off * targets.orientation_weight[:, None]) ** 2, axis=(1, 2)
-    )
-
-
-def _part(targets: Targets, frames: slice | np.ndarray) -> Targets:
-    return Targets(
-        targets.point_joint,
-        targets.point_offset,
-        targets.positions[frames],
-        targets.position_weight,
-        targets.frame_joint,
-        targets.orientations[frames],
-        targets.orientation_weight,
     )
 
 
@@ -157,12 +154,12 @@ def _solve(
     """One chunk of :func:`solve`; a frame that has settled takes no part in further steps."""
     best = start.copy()
     active = np.arange(len(start))
-    normal, gradient, cost = _normal_equations(skeleton, start, start, targets, stay)
+    normal, gradient, cost = normal_equations(skeleton, start, start, targets, stay)
     squared = np.full(len(start), damping**2)
     for _ in range(iterations):
         trial = _step(best[active], normal, gradient, squared, limits)
-        here = _part(targets, active)
-        new_normal, new_gradient, new_cost = _normal_equations(skeleton, trial, start[active], here, stay)
+        here = targets.at(active)
+        new_normal, new_gradient, new_cost = normal_equations(skeleton, trial, start[active], here, stay)
         # A full step from a nearly straight limb can throw it anywhere: a worse frame goes back and steps shorter.
         better = new_cost < cost
         gain = cost - new_cost
@@ -197,7 +194,16 @@ def _step(qpos: Array, normal: Array, gradient: Array, squared: Array, limits: A
         damped[frames, held, :] = 0.0
         damped[frames, :, held] = 0.0
         damped[frames, held, held] = 1.0
-    step = np.clip(np.linalg.solve(damped, pull[..., None])[..., 0], -0.5, 0.5)
+    step = np.linalg.solve(damped, pull[..., None])[..., 0]
+    return moved(qpos, np.asarray(step, dtype=np.float64), limits)
+
+
+def moved(qpos: Array, step: Array, limits: Array | None) -> Array:
+    """``qpos [T, nq]`` after a step ``[T, 6 + D]`` in the columns of :func:`normal_equations`.
+
+    No number steps by more than 0.5, and hinges stay within ``limits [D, 2]``.
+    """
+    step = np.clip(step, -0.5, 0.5)
     out = qpos.copy()
     out[:, :3] += step[:, :3]
     out[:, 3:7] = rot.normalize(rot.multiply(rot.from_rotvec(step[:, 3:6]), out[:, 3:7]))
@@ -207,12 +213,16 @@ def _step(qpos: Array, normal: Array, gradient: Array, squared: Array, limits: A
     return out
 
 
-def _normal_equations(
+def normal_equations(
     skeleton: Skeleton, qpos: Array, start: Array, targets: Targets, stay: float
 ) -> tuple[Array, Array, Array]:
-    """Gauss-Newton's matrix ``[T, 6 + D, 6 + D]``, right side ``[T, 6 + D]`` and the cost ``[T]`` (m^2) at ``qpos``."""
+    """Gauss-Newton's matrix ``[T, 6 + D, 6 + D]``, right side ``[T, 6 + D]`` and the cost ``[T]`` (m^2) at ``qpos``.
+
+    The columns are the root's position (m), its rotation vector in the world (rad) and the hinges (rad). The other
+    arguments are those of :func:`solve`.
+    """
     n, frames = skeleton.n_dofs, len(qpos)
-    w_p, w_o = targets.position_weight[:, None], targets.orientation_weight[:, None]
+    w_p, w_o = targets.position_weight[..., None], targets.orientation_weight[:, None]
     positions, quats, axes = _kinematics(skeleton, qpos)
     points = positions[:, targets.point_joint] + rot.rotate(quats[:, targets.point_joint], targets.point_offset[None])
     off = rot.multiply(targets.orientations, rot.conjugate(quats[:, targets.frame_joint]))
@@ -221,12 +231,12 @@ def _normal_equations(
         axis=1,
     )
     jacobian = _jacobian(skeleton, targets, positions, points, axes)
-    moved = start[:, 7:] - qpos[:, 7:]
+    away = start[:, 7:] - qpos[:, 7:]
     normal = jacobian.transpose(0, 2, 1) @ jacobian
     normal[:, np.arange(6, 6 + n), np.arange(6, 6 + n)] += stay**2
     gradient = (residual[:, None] @ jacobian)[:, 0]
-    gradient[:, 6:] += stay**2 * moved
-    return normal, gradient, np.sum(residual**2, axis=1) + stay**2 * np.sum(moved**2, axis=1)
+    gradient[:, 6:] += stay**2 * away
+    return normal, gradient, np.sum(residual**2, axis=1) + stay**2 * np.sum(away**2, axis=1)
 
 
 def _jacobian(skeleton: Skeleton, targets: Targets, positions: Array, points: Array, axes: Array) -> Array:
@@ -239,16 +249,18 @@ def _jacobian(skeleton: Skeleton, targets: Targets, positions: Array, points: Ar
     # The root turns about the world's axes at its own place, as three more hinges that move everything.
     turns = np.concatenate([np.broadcast_to(np.eye(3), (frames, 3, 3)), axes], axis=1)
     origins = np.concatenate([np.repeat(positions[:, :1], 3, axis=1), positions[:, skeleton.dof_joint]], axis=1)
-    weight = np.ones((k + m, 3 + n))
-    weight[:k, 3:], weight[k:, 3:] = moves[targets.point_joint], moves[targets.frame_joint]
-    weight *= np.concatenate([targets.position_weight, targets.orientation_weight])[:, None]
+    point_weight, frame_weight = np.ones((k, 3 + n)), np.ones((m, 3 + n))
+    point_weight[:, 3:], frame_weight[:, 3:] = moves[targets.point_joint], moves[targets.frame_joint]
+    # [K, 3 + D], or [T, K, 3 + D] where the frames' weights differ.
+    point_weight = point_weight * targets.position_weight[..., None]
+    frame_weight *= targets.orientation_weight[:, None]
     out = np.zeros((frames, k + m, 3, 6 + n))
-    out[:, :k, :, :3] = np.eye(3) * targets.position_weight[:, None, None]
+    out[:, :k, :, :3] = np.eye(3) * targets.position_weight[..., None, None]
     x, y, z = (turns[:, None, :, i] for i in range(3))
     # axis x (point - origin) = axis x point + origin x axis: the second part is the same for every point.
     rest = np.cross(origins, turns)
     px, py, pz = (points[:, :, None, i] for i in range(3))
     for i, product in enumerate((y * pz - z * py, z * px - x * pz, x * py - y * px)):
-        out[:, :k, i, 3:] = (product + rest[:, None, :, i]) * weight[:k]
-        out[:, k:, i, 3:] = turns[:, None, :, i] * weight[k:]
+        out[:, :k, i, 3:] = (product + rest[:, None, :, i]) * point_weight
+        out[:, k:, i, 3:] = turns[:, None, :, i] * frame_weight
     return out.reshape(frames, 3 * (k + m), 6 + n)

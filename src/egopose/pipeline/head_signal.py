@@ -8,11 +8,11 @@ from pathlib import Path
 from typing import Any
 
 from egopose.checkpoint.head_signal import save_head_signal_regressor
-from egopose.core.config import compose_config, convert, from_mapping
+from egopose.core.config import from_mapping
 from egopose.core.errors import InputError
-from egopose.data.preparation import humanoid_of, prepare
-from egopose.data.splits import WHOLE, split_takes
+from egopose.data.preparation import humanoid_of
 from egopose.motion.rotations import Array
+from egopose.pipeline.mocap_sources import clips_of
 from egopose.training.head_signal_figures import held_out_figures
 from egopose.training.head_signal_regressor import HeadSignalSettings, train_head_signal_regressor
 
@@ -22,31 +22,13 @@ _SOURCE = "conf/head_signal.yaml"
 def motions_of(values: Mapping[str, Any]) -> tuple[list[Array], list[Array]]:
     """Motions ``qpos [T, nq]`` to learn from and to be judged on, of the sources in ``conf/head_signal.yaml``.
 
-    Each source is a choice of ``conf/data``. Those in ``whole`` train with all their takes, others as they are split.
+    See :func:`egopose.pipeline.mocap_sources.clips_of`.
 
     Raises:
         InputError: a source cannot be used, none is given, or ``whole`` names none of them.
     """
-    sources = {name: folder for name, folder in values["sources"].items() if folder is not None}
-    whole = convert(values["whole"], tuple[str, ...], _SOURCE, "whole")
-    if not sources:
-        raise InputError(_SOURCE, "sources", "none is given: sources.cmu_people=FOLDER")
-    if unknown := set(whole) - set(values["sources"]):
-        raise InputError(_SOURCE, "whole", f"{sorted(unknown)[0]!r} is no source; there are {', '.join(sources)}")
-    train: list[Array] = []
-    test: list[Array] = []
-    for name, folder in sources.items():
-        config = compose_config("train", [f"data={name}"])
-        config["data"]["folder"] = convert(folder, str, _SOURCE, f"sources.{name}")
-        store = prepare({**config, "humanoid": values["humanoid"], "sim": values["sim"]}, flow=False)
-        split = WHOLE if name in whole else config["data"]["split"]
-        for part, motions in (("train", train), ("test", test)):
-            if part == "test" and name in whole:
-                continue
-            # A split leaves out what a body on a bare floor cannot do; a head's signal is true of it all the same.
-            pieces = split_takes(store.takes, split, part, supported_only=False)
-            motions += [store.clip(piece.take).qpos[piece.start : piece.stop] for piece in pieces]
-    return train, test
+    train, test = clips_of(values, _SOURCE)
+    return [clip.qpos for clip in train], [clip.qpos for clip in test]
 
 
 def make_head_signal_regressor(values: Mapping[str, Any]) -> dict[str, dict[str, float]]:

@@ -1,0 +1,38 @@
+"""How a contact network is saved and loaded."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from egopose.checkpoint.checkpoint import RunCheckpoint, metadata_of, read_json
+from egopose.core.config import convert
+from egopose.core.errors import InputError
+from egopose.scene.contacts import FEET, ContactNetwork
+
+_KIND = "contact network"
+_MOST_UNITS = 65_536
+
+
+def save_contact_network(network: ContactNetwork, settings: Mapping[str, Any], folder: Path) -> None:
+    """Write a network to ``folder``, with the settings that made it; ``settings["widths"]`` are its layers'."""
+    metadata = metadata_of(_KIND, len(FEET), 0, 0, 0.0)
+    RunCheckpoint({"network": network, "config": dict(settings)}).save(folder, metadata=metadata)
+
+
+def load_contact_network(folder: Path) -> ContactNetwork:
+    """A saved network, in evaluation mode.
+
+    Raises:
+        InputError: there is none, or a file of it is damaged.
+    """
+    if not (folder / "manifest.json").is_file():
+        raise InputError(folder, _KIND, "is not there: egopose train --config-name contacts makes one")
+    config = read_json(folder, "config")
+    widths = convert(config.get("widths"), tuple[int, ...], str(folder), "widths")
+    if not widths or min(widths) < 1 or max(widths) > _MOST_UNITS or len(widths) > 16:
+        raise InputError(folder, "widths", f"cannot be those of a {_KIND}: {widths}")
+    network = ContactNetwork(widths)
+    RunCheckpoint({"network": network}).restore(folder, {"network"})
+    return network.eval()

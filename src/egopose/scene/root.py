@@ -1,0 +1,245 @@
+"""Where a body is in the world, from poses relative to its pelvis and from its contacts, before any physics.
+
+Feet that touch something stay where they are, and carry the body. In flight the centre of mass falls as gravity has
+it. Everything is one linear least-squares problem over the clip. World: z up, m. It is the start of the reconstruction
+with physics, and its baseline.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+
+from egopose.motion.rotations import Array
+
+GRAVITY = 9.81
+
+
+@dataclass(frozen=True)
+class RootSettings:
+    """Scales of the residuals: what counts as much as what.
+
+    Args:
+        slip: m/s, of a foot that stands firmly.
+        settling: s after a contact's beginning, and before its end, in which a foot does not yet stand firmly.
+        guessed: firmness of a foot that must stand though no contact is known, 0 to 1.
+        flight: m/s^2, of what the centre of mass's acceleration in flight differs from gravity by.
+        sway: m/s^2, of the centre of mass's acceleration on the feet; it only fills what feet leave open.
+        level: m: supports whose heights differ by less are one level, where one foot stands while the other lands.
+        level_in_flight: m: likewise after a flight, whose height is known less well.
+        lowness: m: of a foot's points, those that much higher than the lowest hardly count.
+        ballistic: least share of a time without contact that take-off and landing speeds must tell of, to be a flight.
+    """
+
+    slip: float = 0.02
+    settling: float = 0.1
+    guessed: float = 0.05
+    flight: float = 0.5
+    sway: float = 5.0
+    level: float = 0.08
+    level_in_flight: float = 0.15
+    lowness: float = 0.02
+    ballistic: float = 0.2
+
+
+@dataclass(frozen=True)
+class Support:
+    """A foot that stands: frames ``start .. stop - 1`` and the height of what it stands on, m."""
+
+    foot: int
+    start: int
+    stop: int
+    height: float
+
+
+@dataclass(frozen=True)
+class KinematicRoot:
+    """Args: ``positions [T, 3]`` m of the pelvis; ``supports`` in order of time; ``flight [T]`` who flies when."""
+
+    positions: Array
+    supports: tuple[Support, ...]
+    flight: NDArray[np.bool_]
+
+
+def kinematic_root(
+    feet: Array, contacts: np.ndarray, center_of_mass: Array, fps: float, settings: RootSettings | None = None
+) -> KinematicRoot:
+    """The pelvis's way through the world.
+
+    Args:
+        feet: ``[T, F, P, 3]`` m, relative to the pelvis, z up: P points on each foot's sole (heel, ball). The lowest
+            of them stands.
+        contacts: ``[T, F]`` whether the foot touches something.
+        center_of_mass: ``[T, 3]`` m, relative to the pelvis.
+        fps: frames per second.
+        settings: see :class:`RootSettings`.
+
+    Returns:
+        See :class:`KinematicRoot`. The first support's height is 0 and the pelvis starts at x = y = 0.
+
+    Raises:
+        ValueError: shapes do not agree, a value is not finite, or no foot ever touches anything.
+    """
+    settings = settings or RootSettings()
+    feet, center_of_mass = np.asarray(feet, dtype=np.float64), np.asarray(center_of_mass, dtype=np.float64)
+    contacts = np.asarray(contacts, dtype=bool)
+    if feet.ndim != 4 or feet.shape[3] != 3 or contacts.shape != feet.shape[:2]:
+        raise ValueError(f"feet must be [T, F, P, 3], contacts [T, F]: {list(feet.shape)}, {list(contacts.shape)}")
+    if center_of_mass.shape != (len(feet), 3):
+        raise ValueError(f"center_of_mass must be [{len(feet)}, 3], got {list(center_of_mass.shape)}")
+    if not (np.isfinite(feet).all() and np.isfinite(center_of_mass).all()):
+        raise ValueError("feet and center_of_mass must be finite")
+    if not contacts.any():
+        raise ValueError("no foot ever touches anything: there is nothing to stand on")
+    # The point that carries moves from heel to ball: its velocity is the mean of the low points' velocities.
+    share = np.exp(-(feet[..., 2] - feet[..., 2].min(axis=2, keepdims=True)) / settings.lowness)
+    share /= share.sum(axis=2, keepdims=True)
+    between = 0.5 * (share[1:] + share[:-1])
+    steps = (np.diff(feet, axis=0) * (between / between.sum(axis=2, keepdims=True))[..., None]).sum(axis=2)
+    firmness, flight = _firmness(contacts, feet, steps, center_of_mass, fps, settings)
+    positions = _least_squares(steps, firmness, flight, center_of_mass, fps, settings)
+    lowest = positions[:, None, 2] + feet[..., 2].min(axis=2)
+    supports = _levelled(lowest, contacts, settings)
+    positions = _on_supports(positions, lowest, supports, flight, center_of_mass, fps, settings)
+    return KinematicRoot(positions - [*positions[0, :2], 0.0], supports, flight)
+
+
+def _firmness(
+    contacts: np.ndarray, feet: Array, steps: Array, center_of_mass: Array, fps: float, settings: RootSettings
+) -> tuple[Array, NDArray[np.bool_]]:
+    """How firmly each foot stands ``[T, F]``, 0 to 1, and which frames ``[T]`` are in flight.
+
+    A body that leaves with vertical speed u and lands with w has flown for (u - w) / g. Contacts are known to a few
+    frames only, so the flight is that long in the middle of the time without contact. In a step without contact the
+    body sinks and then rises: u < w. There the lower foot must stand.
+    """
+    out = np.zeros(contacts.shape)
+    frames = len(contacts)
+    for foot in range(contacts.shape[1]):
+        for start, stop in _runs(contacts[:, foot]):
+            inside = np.arange(start, stop)
+            # The clip's ends cut contacts off: those edges are none.
+            after = inside - start + 1 if start > 0 else np.full(stop - start, frames)
+            before = stop - inside if stop < frames else np.full(stop - start, frames)
+            out[start:stop, foot] = np.minimum(1.0, np.minimum(after, before) / (settings.settling * fps)) ** 2
+    lower = feet[..., 2].min(axis=2).argmin(axis=1)
+    flight = np.zeros(frames, dtype=bool)
+    for start, stop in _runs(np.asarray(~contacts.any(axis=1))):
+        told = 0.0
+        if start > 0 and stop < frames:
+            left, landed = (_rise(steps, contacts, center_of_mass, frame, fps) for frame in (start - 1, stop))
+            told = (left - landed) / GRAVITY * fps
+        if told >= settings.ballistic * (stop - start):
+            spare = int(max(0.0, (stop - start - told) / 2))
+            flight[start + spare : stop - spare] = True
+        else:
+            out[np.arange(start, stop), lower[start:stop]] = settings.guessed
+    return out, flight
+
+
+def _rise(steps: Array, contacts: np.ndarray, center_of_mass: Array, frame: int, fps: float) -> float:
+    """Vertical speed (m/s) of the centre of mass over the foot that stands at ``frame``, by the two steps around it."""
+    foot = int(np.argmax(contacts[frame]))
+    around = [t for t in (frame - 1, frame) if 0 <= t < len(steps) and contacts[t : t + 2, foot].all()]
+    around = around or [min(max(frame - 1, 0), len(steps) - 1)]
+    moves = [center_of_mass[t + 1, 2] - center_of_mass[t, 2] - steps[t, foot, 2] for t in around]
+    return float(np.mean(moves)) * fps
+
+
+def _least_squares(
+    steps: Array,
+    firmness: Array,
+    flight: NDArray[np.bool_],
+    center_of_mass: Array,
+    fps: float,
+    settings: RootSettings,
+) -> Array:
+    """``[T, 3]`` m: the pelvis, from 0 on: standing feet slip least, and flights are nearest to gravity's."""
+    frames = len(firmness)
+    if frames < 2:
+        return np.zeros((frames, 3))
+    change = sparse.eye_array(frames, k=1, format="csr")[: frames - 1] - sparse.eye_array(frames, format="csr")[:-1]
+    rows, values = [sparse.eye_array(frames, format="csr")[:1]], [np.zeros((1, 3))]
+    for foot in range(firmness.shape[1]):
+        weight = np.minimum(firmness[1:, foot], firmness[:-1, foot]) * fps / settings.slip
+        rows.append(sparse.diags_array(weight).tocsr() @ change)
+        values.append(-steps[:, foot] * weight[:, None])
+    bend, target = _bending(flight, center_of_mass, fps, settings)
+    matrix = sparse.vstack([*rows, bend]).tocsc()
+    normal = (matrix.T @ matrix + 1e-9 * sparse.eye_array(frames)).tocsc()
+    out: Array = sparse.linalg.spsolve(normal, matrix.T @ np.concatenate([*values, target])).reshape(frames, 3)
+    return out
+
+
+def _bending(
+    flight: NDArray[np.bool_], center_of_mass: Array, fps: float, settings: RootSettings
+) -> tuple[sparse.csr_array, Array]:
+    """Rows and values of the centre of mass's acceleration: gravity in flight, little on the feet."""
+    frames = len(flight)
+    if frames < 3:
+        return sparse.csr_array((0, frames)), np.zeros((0, 3))
+    ones = np.ones(frames - 2)
+    second = sparse.diags_array([ones, -2 * ones, ones], offsets=[0, 1, 2], shape=(frames - 2, frames)).tocsr()
+    scale = np.where(flight[1:-1], settings.flight, settings.sway)
+    fall = np.outer(flight[1:-1], [0.0, 0.0, -GRAVITY])
+    target = (fall - np.diff(center_of_mass, n=2, axis=0) * fps**2) / scale[:, None]
+    return sparse.diags_array(fps**2 / scale).tocsr() @ second, target
+
+
+def _levelled(lowest: Array, contacts: np.ndarray, settings: RootSettings) -> tuple[Support, ...]:
+    """Supports with their heights over the first; those close to an earlier one's are put on it.
+
+    Args:
+        lowest: ``[T, F]`` m, heights of the feet's lowest points.
+        contacts: ``[T, F]``.
+        settings: tell which heights are one level.
+    """
+    runs = sorted((start, stop, foot) for foot in range(contacts.shape[1]) for start, stop in _runs(contacts[:, foot]))
+    found: list[Support] = []
+    for start, stop, foot in runs:
+        height = float(np.median(lowest[start:stop, foot]))
+        # What the way here added to the height, by slipping and noise, is taken off against the support before it.
+        if found:
+            before = found[-1]
+            height += before.height - float(np.median(lowest[before.start : before.stop, before.foot]))
+            level = settings.level if before.stop >= start else settings.level_in_flight
+            near = min((other.height for other in found), key=lambda other: abs(other - height))
+            height = near if abs(near - height) < level else height
+        else:
+            height = 0.0
+        found.append(Support(foot, start, stop, height))
+    return tuple(found)
+
+
+def _on_supports(
+    positions: Array,
+    lowest: Array,
+    supports: tuple[Support, ...],
+    flight: NDArray[np.bool_],
+    center_of_mass: Array,
+    fps: float,
+    settings: RootSettings,
+) -> Array:
+    """The positions with the heights solved again, so that feet stand at their supports' heights."""
+    frames = len(positions)
+    weight, wanted = np.zeros(frames), np.zeros(frames)
+    for support in supports:
+        span = slice(support.start, support.stop)
+        weight[span] += 1.0
+        wanted[span] += support.height - (lowest[span, support.foot] - positions[span, 2])
+    bend, target = _bending(flight, center_of_mass, fps, settings)
+    stand = weight / (0.01**2)  # a centimetre: what a sole's joints are wrong by
+    normal = (bend.T @ bend + sparse.diags_array(stand) + 1e-9 * sparse.eye_array(frames)).tocsc()
+    right = bend.T @ target[:, 2] + stand * wanted / np.maximum(weight, 1.0)
+    out = positions.copy()
+    out[:, 2] = sparse.linalg.spsolve(normal, right)
+    return out
+
+
+def _runs(mask: np.ndarray) -> list[tuple[int, int]]:
+    """``[start, stop)`` of every run of True."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], mask.astype(np.int8), [0]])))
+    return [(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)]

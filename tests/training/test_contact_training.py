@@ -1,0 +1,119 @@
+"""Training the contact network: what the clips say, that it learns, and the command."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from helpers.mocap import default_humanoid, short_clips
+from helpers.walking import walking
+
+from egopose.checkpoint.contacts import load_contact_network
+from egopose.core.config import compose_config, from_mapping
+from egopose.core.errors import InputError
+from egopose.pipeline import mocap_sources
+from egopose.pipeline.contacts import train_contacts
+from egopose.training.contact_network import (
+    ContactClip,
+    ContactSettings,
+    accuracy_table,
+    contact_clip,
+    overall,
+    seen_by,
+    train_contact_network,
+    training_rows,
+)
+
+TINY: dict[str, Any] = {"widths": (32, 16), "epochs": 2, "batch": 16, "bfloat16": False}
+
+
+def settings(**changed: Any) -> ContactSettings:
+    shipped = from_mapping(ContactSettings, compose_config("contacts", ["out=x"])["training"], "conf")
+    return replace(shipped, **{**TINY, **changed})
+
+
+def clip() -> ContactClip:
+    return contact_clip(default_humanoid(), walking(), settings())
+
+
+def test_a_walks_contacts_are_those_of_its_feet() -> None:
+    walk = clip()
+    assert walk.contacts.any(axis=1).mean() > 0.9  # who walks has a foot down
+    assert 0.4 < walk.contacts.mean() < 0.9
+    assert 1.6 < walk.height < 2.1
+    # An ankle whose foot is down is low and slow beside one that swings.
+    ankles = walk.points[:, [3, 6]]
+    speed = np.linalg.norm(np.gradient(ankles, axis=0), axis=-1) * walk.fps
+    assert speed[~walk.contacts].mean() > 3 * speed[walk.contacts].mean()
+    assert ankles[..., 2][~walk.contacts].mean() > ankles[..., 2][walk.contacts].mean()
+
+
+def test_keypoints_are_as_wrong_as_asked() -> None:
+    walk = clip()
+    for level in (0.01, 0.03):
+        exact = settings(error=(0.0, 0.0), dropped=0.0)
+        noisy = settings(error=(level, level), dropped=0.0, definition=0.0)
+        off = []
+        for seed in range(12):
+            true, seen = (seen_by(walk, "fixed", s, np.random.default_rng(seed)).keypoints for s in (exact, noisy))
+            # A body height in the picture, by thigh and shank, which stand at about 0.49 of it.
+            leg = np.linalg.norm(true[:, 1] - true[:, 2], axis=-1) + np.linalg.norm(true[:, 2] - true[:, 3], axis=-1)
+            off.append(np.linalg.norm(seen - true, axis=-1).mean() / (leg.max() / 0.49))
+        assert np.mean(off) == pytest.approx(level, rel=0.35)
+
+
+def test_it_learns_a_walk_and_is_the_same_each_time() -> None:
+    clips = [clip()] * 8
+    simple = settings(error=(0.0, 0.0), epochs=25, learning_rate=0.01, dropout=0.0)
+    told: list[float] = []
+    network = train_contact_network(clips, simple, lambda epoch, loss, seconds: told.append(loss))
+    assert told[-1] < 0.5 * told[0]
+    table = accuracy_table(network, clips[:1], simple, 1)
+    assert overall(table["undone"]["pan"], clips[:1]) > 0.85
+    few = replace(simple, epochs=1)
+    one, other = (train_contact_network(clips[:2], few).state_dict() for _ in range(2))
+    assert all(torch.equal(one[name], other[name]) for name in one)
+
+
+def test_rows_are_windows_with_their_labels() -> None:
+    walk = clip()
+    windows, labels = training_rows([walk, walk], settings(), np.random.default_rng(0))
+    assert windows.shape == (2 * len(walk.points), 189)
+    np.testing.assert_array_equal(labels[: len(walk.points), 2], walk.contacts)
+
+
+@pytest.mark.parametrize(
+    ("changed", "name"),
+    [({"cameras": {"drone": 1.0}}, "drone"), ({"cameras": {"pan": 0.0}}, "cameras"), ({"lasting": 0.8}, "lasting")],
+)
+def test_settings_that_cannot_be_are_refused(changed: dict[str, Any], name: str) -> None:
+    with pytest.raises(InputError, match=name):
+        settings(**changed)
+
+
+def test_the_command_trains_judges_and_saves(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    composed = compose_config("train", short_clips(tmp_path))
+    composed["data"]["split"] = {"kind": "subject", "test_subjects": ["turn"], "shortest": 8, "subjects": None}
+    monkeypatch.setattr(mocap_sources, "compose_config", lambda name, words: composed)
+    out = tmp_path / "network"
+    words = [f"sources.cmu6={tmp_path / 'mocap'}", "whole=[]", f"out={out}", "training.widths=[16]"]
+    values = compose_config("contacts", [*words, "training.epochs=1", "training.batch=8", "training.bfloat16=false"])
+    train_contacts(values)
+    assert "held-out people, camera undone: fixed" in capsys.readouterr().out
+    result = json.loads((out / "result.json").read_text())
+    assert set(result["accuracy"]["as seen"]) == {"fixed", "pan", "zoom", "track"}
+    network = load_contact_network(out / "network")
+    assert not network.training
+    table = accuracy_table(network, [clip()], settings(), 0)
+    assert 0.0 <= overall(table["as seen"]["fixed"], [clip()]) <= 1.0
+    with pytest.raises(InputError, match="is there already"):
+        train_contacts(values)
+    with pytest.raises(InputError, match="config-name contacts"):
+        load_contact_network(tmp_path / "none")
