@@ -15,7 +15,7 @@ from egopose.pipeline.mocap_sources import clips_of
 from egopose.training.contact_network import ContactClip, ContactSettings, accuracy_table, contact_clip, overall
 
 MOVING = ("pan", "zoom", "track")
-DRAWS = 2
+DRAWS = 1
 
 
 def moving(rows: dict[str, dict[str, float]], clips: list[ContactClip]) -> float:
