@@ -130,7 +130,9 @@ class Bomb:
         return exec, ("raise SystemExit('a pickle was opened')",)
 
 
-@pytest.mark.parametrize(("name", "way"), [("vibe_output.pkl", "joblib.load"), ("hmr4d_results.pt", "torch.load")])
+@pytest.mark.parametrize(
+    ("name", "way"), [("vibe_output.pkl", "from joblib import load"), ("hmr4d_results.pt", "from torch import load")]
+)
 def test_a_pickle_is_refused_with_the_way_to_convert_it(tmp_path: Path, name: str, way: str) -> None:
     (tmp_path / name).write_bytes(pickle.dumps(Bomb()))
     with pytest.raises(InputError, match=way) as error:
