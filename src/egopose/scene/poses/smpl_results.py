@@ -22,11 +22,13 @@ _SPIN = 49
 _FURTHEST = 1e5
 
 _CONVERT_PKL = (
-    "import numpy; from joblib import load; [numpy.savez(f'person{k}.npz', **{n: v for n, v in p.items() if isinstance(v, "
+    "import numpy; from joblib import load; "
+    "[numpy.savez(f'person{k}.npz', **{n: v for n, v in p.items() if isinstance(v, "
     "numpy.ndarray)}) for k, p in load(FILE).items()]"
 )
 _CONVERT_PT = (
-    "import numpy; from torch import load; numpy.savez('person.npz', **{n: v.numpy() for n, v in load(FILE, weights_only=True)"
+    "import numpy; from torch import load; "
+    "numpy.savez('person.npz', **{n: v.numpy() for n, v in load(FILE, weights_only=True)"
     "['smpl_params_global'].items()})"
 )
 
