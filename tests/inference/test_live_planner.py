@@ -11,6 +11,7 @@ import pytest
 import torch
 from helpers.live_stand_in import untrained
 
+from egopose.benchmarks import stream as bench
 from egopose.core.config import compose_config
 from egopose.core.torch_settings import torch_threads
 from egopose.envs.problem import Followed, global_frame
@@ -253,3 +254,27 @@ def test_a_tracker_is_planned_for_along_the_known_path() -> None:
     (window,) = (part for part in planner._env.transform if isinstance(part, TargetWindow))
     assert window.path.shape == (ROWS, 3)
     assert np.abs(window.path).max() > 0
+
+
+# --- the bench -------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("soak", [False, True])
+def test_the_bench_counts_resets_with_the_planner_and_without(monkeypatch: pytest.MonkeyPatch, soak: bool) -> None:
+    told: list[dict[str, Any]] = []
+
+    def measured(values: dict[str, Any], trained: Trained, forecaster: Any, progress: bool) -> dict[str, Any]:
+        told.append(values)
+        counts = {"poses": 900, "resets": 2 if values["planner"] else 21, "dropped": 0, "fps": 30.0, "seconds": 30.0}
+        return {**counts, "stages": {"compute": {"p50_ms": 1.0}}}
+
+    monkeypatch.setattr(bench, "_measured", measured)
+    monkeypatch.setattr(bench, "untrained", lambda config: untrained())
+    words = ["stream.source=a.mp4", "stream.seconds=15", "stream.server.port=0", *(["stream.pace=real_time"] * soak)]
+    found = bench.run(words, 2)
+    assert found["resets_per_minute"] == pytest.approx(4.0)
+    assert found["alone_resets_per_minute"] == (None if soak else pytest.approx(42.0))
+    paced = [values for values in told if values["pace"] == "real_time"]
+    same = ("source", "seconds", "lookahead", "repeat")
+    assert [[values[name] for name in same] for values in paced] == [["a.mp4", 30, 10, True]] * (1 if soak else 2)
+    assert [bool(values["planner"]) for values in paced] == [True, False][: len(paced)]

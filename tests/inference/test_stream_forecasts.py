@@ -69,7 +69,8 @@ def trained() -> Trained:
 
 
 def values_of(*changed: str) -> dict[str, Any]:
-    return compose_config("stream", ["source=none", "checkpoint=none", "server.port=null", *changed])
+    words = ["source=none", "checkpoint=none", "server.port=null", "planner=none"]
+    return compose_config("stream", [*words, *changed])
 
 
 def forecaster_of(trained: Trained, *changed: str) -> Forecaster:

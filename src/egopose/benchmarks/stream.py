@@ -53,8 +53,9 @@ def run(overrides: Sequence[str], rounds: int) -> dict[str, Any]:
     Without ``stream.checkpoint`` the networks are untrained (their weights' values cost nothing) and of the training
     configuration; without ``stream.source`` the video is the longest rendered take of its data, or of the run's.
     ``stream.forecast.checkpoint=untrained`` puts forecasts beside it, by untrained networks of ``task=forecasting``.
-    A soak, ``stream.pace=real_time``, leaves the first part out: it costs what a live camera costs. Each minute's
-    memory is then told on standard error.
+    With a planner the policy alone then does the same at a camera's pace, so that resets can be compared.
+    A soak, ``stream.pace=real_time``, leaves the first part and the last one out: it costs what a live camera costs.
+    Each minute's memory is then told on standard error.
 
     Results go nowhere, but for what is named: ``stream.out``, ``stream.forecast.out``, and ``stream.server.port``,
     which is read along by a client of each kind.
@@ -66,9 +67,11 @@ def run(overrides: Sequence[str], rounds: int) -> dict[str, Any]:
     Returns:
         At full speed: ``fps``, and of a soak as ``paced_fps``. At a camera's pace: ``p50_ms``, ``p95_ms``, ``p99_ms``
         of a frame's computing, ``dropped`` (late frames), ``stages`` (percentiles of each stage; ``delay``: from a
-        frame's arrival to the estimate it completes), ``paced_fps``, ``cores`` (processor time over time), the counts
-        and memory of :meth:`egopose.inference.stream.loop.LiveLoop.status`. Beside them ``source``, ``policy``,
-        ``vision``, ``substeps``.
+        frame's arrival to the estimate it completes), ``resets_per_minute`` of estimated motion, the same of the policy
+        alone as ``alone_resets_per_minute`` (None where nothing plans, and of a soak), ``paced_fps``, ``cores``
+        (processor time over time), the counts and memory of
+        :meth:`egopose.inference.stream.loop.LiveLoop.status`. Beside them ``source``, ``policy``, ``vision``,
+        ``substeps``.
 
     Raises:
         InputError: a setting is unknown or out of range, the source cannot be read.
@@ -98,6 +101,12 @@ def run(overrides: Sequence[str], rounds: int) -> dict[str, Any]:
     quick = None if soak else _measured({**values, "pace": "every", "seconds": seconds}, trained, forecaster, False)
     busy = time.process_time()
     paced = _measured({**values, "pace": "real_time", "seconds": seconds * rounds}, trained, forecaster, soak)
+    cores = (time.process_time() - busy) / paced["seconds"]
+    alone = None
+    if values["planner"] and not soak:
+        lone = {"planner": None, "out": None, "server": {**values["server"], "port": None}}
+        without = {**values, **lone, "pace": "real_time", "seconds": seconds * rounds}
+        alone = _resets_per_minute(_measured(without, trained, None, False), trained.humanoid)
     compute = paced["stages"].get("compute")
     if compute is None:
         raise InputError("bench stream", "stream.seconds", f"{seconds}: too short for a single frame")
@@ -107,7 +116,9 @@ def run(overrides: Sequence[str], rounds: int) -> dict[str, Any]:
         "dropped": paced["dropped"],
         "stages": paced["stages"],
         "paced_fps": paced["fps"],
-        "cores": (time.process_time() - busy) / paced["seconds"],
+        "resets_per_minute": _resets_per_minute(paced, trained.humanoid),
+        "alone_resets_per_minute": alone,
+        "cores": cores,
         **{key: value for key, value in paced.items() if key not in ("dropped", "stages", "fps")},
         "source": Path(source).name,
         "policy": "untrained" if values["checkpoint"] is None else str(values["checkpoint"]),
@@ -142,6 +153,12 @@ def _measured(
 
         settle_memory()
         return loop.run(sinks.on_pose, on_status, None, sinks.on_forecast)
+
+
+def _resets_per_minute(status: Mapping[str, Any], humanoid: HumanoidModel) -> float | None:
+    """Of the motion that was given out; None if there is none."""
+    minutes = status["poses"] * humanoid.control_dt / 60.0
+    return status["resets"] / minutes if minutes else None
 
 
 def _listen(server: str, token: str | None) -> None:
