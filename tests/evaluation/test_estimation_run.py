@@ -32,6 +32,8 @@ from egopose.vision.video import probe_video, write_video
 FRAMES = 24
 EVALUATE = {
     "split": "test",
+    "causal": False,
+    "lookahead": 10,
     "failsafe": {"mode": "value", "reset_threshold": 0.6, "fallen_height": 0.3},
     "failsafe_report": {"window": 5},
     "contact": {"height": 0.03, "speed": 0.5},

@@ -13,6 +13,7 @@ from egopose.core.errors import InputError
 from egopose.core.torch_settings import torch_threads
 from egopose.data.fragments import FragmentLike
 from egopose.envs.test_time import Controller
+from egopose.evaluation.live_run import live_estimates
 from egopose.evaluation.protocols import ContactSettings, TakeScores, score_take
 from egopose.evaluation.resets import TakeTriggers, as_dict, take_triggers
 from egopose.inference.counterfactuals import CounterfactualRollouts
@@ -58,6 +59,7 @@ def evaluate_agent(
     threads: int,
     window: int | None = None,
     planner: AnyPlannerSettings | None = None,
+    lookahead: int | None = None,
 ) -> list[FragmentResult]:
     """Estimate every fragment in one pass, all side by side, and score it beside PoseReg.
 
@@ -71,6 +73,8 @@ def evaluate_agent(
         threads: of the physics.
         window: frames after a trigger within which the body must have fallen without it; None to judge no triggers.
         planner: how the body looks ahead; None for the policy alone.
+        lookahead: frames that a live stream sees ahead, to estimate as it does, one fragment after the other; no
+            trigger is judged then. None: every frame sees the whole take.
 
     Raises:
         InputError: there are no regressed states, or a fragment is shorter than 4 frames.
@@ -81,7 +85,13 @@ def evaluate_agent(
     for fragment, name in zip(fragments, names, strict=True):
         if fragment.stop - fragment.start < SHORTEST:
             raise InputError(name, "length", f"{fragment.stop - fragment.start} frames; metrics need {SHORTEST}")
-    estimates, triggers = estimate_and_judge(agent, len(fragments), split, failsafe, threads, window, planner)
+    estimates: Sequence[Estimate]
+    triggers: Sequence[TakeTriggers | None]
+    if lookahead is not None:
+        estimates = live_estimates(agent, fragments, failsafe, lookahead, threads, planner)
+        triggers = [None] * len(estimates)
+    else:
+        estimates, triggers = estimate_and_judge(agent, len(fragments), split, failsafe, threads, window, planner)
     return [
         _result(agent, fragment, name, estimate, contact, judged)
         for fragment, name, estimate, judged in zip(fragments, names, estimates, triggers, strict=True)

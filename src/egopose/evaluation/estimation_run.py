@@ -24,6 +24,8 @@ from egopose.inference.planners import planned_threshold, read_planner
 from egopose.pipeline.agent import Agent
 from egopose.pipeline.networks import build_networks
 
+_GROUPS = ("failsafe", "planner", "contact", "interval", "survival")
+
 
 @dataclass(frozen=True)
 class Results:
@@ -33,7 +35,7 @@ class Results:
         folder: of all files, see docs/howto-evaluate.md.
         comparison: the table.
         survival: frames survived per run, see :func:`egopose.evaluation.agents.survival_figures`.
-        failsafe: of each run, see :func:`egopose.evaluation.agents.failsafe_figures`.
+        failsafe: of each run, see :func:`egopose.evaluation.agents.failsafe_figures`; none where it is live.
         videos: the side-by-side MP4s.
         notes: what is to be said of the wearer's videos, where any was rendered.
     """
@@ -78,11 +80,15 @@ def run_evaluation(
     labels = fragment_names(names, fragments)
 
     window = int(config["failsafe_report"]["window"])
+    lookahead = int(config["lookahead"]) if config["causal"] else None
     runs = [
-        evaluate_agent(agent, fragments, labels, split, failsafe, contact, threads, window, planner) for agent in agents
+        evaluate_agent(agent, fragments, labels, split, failsafe, contact, threads, window, planner, lookahead)
+        for agent in agents
     ]
     guards = [failsafe.for_run(agent.config, planned_threshold(planner)) for agent in agents]
-    guarded = [failsafe_figures(run, guard, window) for run, guard in zip(runs, guards, strict=True)]
+    guarded = []
+    if lookahead is None:  # a live run's triggers are not simulated on
+        guarded = [failsafe_figures(run, guard, window) for run, guard in zip(runs, guards, strict=True)]
     interval, survive = config["interval"], config["survival"]
     comparison = report.compare_runs(runs, float(interval["level"]), int(interval["draws"]), int(interval["seed"]))
     survival = []
@@ -101,7 +107,7 @@ def run_evaluation(
         "corruption": agents[0].config.get("corruption"),
         "rendered_video": any(v is not None and v.rendered for v in videos),
         "filmed_video": any(v is not None and not v.rendered for v in videos),
-        "settings": {key: config.get(key) for key in ("failsafe", "planner", "contact", "interval", "survival")},
+        "settings": {key: config.get(key) for key in ("causal", "lookahead", *_GROUPS)},
         "survival": survival,
         "failsafe": guarded,
     }

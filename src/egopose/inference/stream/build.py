@@ -28,7 +28,7 @@ from egopose.humanoid.model import HumanoidModel
 from egopose.inference.causal import CausalRegression
 from egopose.inference.failsafe import FailSafeSettings
 from egopose.inference.planner import Planner
-from egopose.inference.planner_settings import planner_settings
+from egopose.inference.planner_settings import PlannerSettings, planner_settings
 from egopose.inference.planners import planned_threshold
 from egopose.inference.stream import live_forecasts, loop
 from egopose.inference.stream.forecasting import ForecastThread
@@ -46,6 +46,7 @@ from egopose.pipeline.forecaster import ForecastCurves, still_forecasts
 from egopose.pipeline.regressor import load_regressor
 from egopose.pipeline.regressor_input import body_part_estimator_name, load_body_part_estimator_of, planes_of
 from egopose.tasks.dataset import Dataset
+from egopose.tasks.imitation import WINDOW
 from egopose.tasks.task import task_name, task_of
 from egopose.vision.flow import FlowConfig
 from egopose.vision.lens import Camera
@@ -216,30 +217,41 @@ def build_loop(
     latency = LatencyTable(loop.STAGES, values["latency_frames"])
     copies = None if planned is None else trained.copies(planned.samples, values["physics_threads"])
 
-    def planner() -> Planner | None:
-        if planned is None or copies is None:
-            return None
-        prepare_for_test(copies, trained.actor, trained.critic)
-        return Planner(
-            copies, trained.actor, trained.critic, planned, Followed(trained.env.base_env.problem.states, global_frame)
-        )
-
     def parts(lap: Callable[[str], None]) -> tuple[FrameFeatures, CausalRegression, LiveBody]:
         """As at the start: nothing seen yet."""
-        task, lookahead = trained.config["task"], values["lookahead"]
+        finder = load_body_part_estimator_of(trained.source_config["regressor"])
         return (
-            FrameFeatures(
-                trained.regressor, flow, camera, rate, load_body_part_estimator_of(trained.source_config["regressor"])
-            ),
-            causal_regression(
-                trained.humanoid, trained.regressor, trained.source_config, task, lookahead, planned is not None
-            ),
-            LiveBody(trained.env, trained.actor, trained.critic, failsafe, lap, planner(), copies),
+            FrameFeatures(trained.regressor, flow, camera, rate, finder),
+            live_regression(trained, values["lookahead"], planned),
+            live_body(trained, failsafe, planned, copies, lap),
         )
 
     warm_up(*parts(lambda stage: None))
     beside = None if forecaster is None else _forecasts(values, forecaster, failsafe.fallen_height, rate)
     return LiveLoop(source, *parts(latency.lap), latency, rate, settings, beside)
+
+
+def live_regression(trained: Trained, lookahead: int, planned: PlannerSettings | None) -> CausalRegression:
+    """The run's regressor, frame by frame; it tells of the look-ahead where a planner or the policy asks for it."""
+    asked = planned is not None or WINDOW in trained.config["model"]["inputs"]
+    task = trained.config["task"]
+    return causal_regression(trained.humanoid, trained.regressor, trained.source_config, task, lookahead, asked)
+
+
+def live_body(
+    trained: Trained,
+    failsafe: FailSafeSettings,
+    planned: PlannerSettings | None,
+    copies: TransformedEnv | None,
+    lap: Callable[[str], None] = lambda stage: None,
+) -> LiveBody:
+    """The run's body, nothing seen yet, and its planner with ``copies`` of its environment; see :class:`LiveBody`."""
+    env, actor, critic = trained.env, trained.actor, trained.critic
+    if planned is None or copies is None:
+        return LiveBody(env, actor, critic, failsafe, lap)
+    prepare_for_test(copies, actor, critic)
+    followed = Followed(env.base_env.problem.states, global_frame)
+    return LiveBody(env, actor, critic, failsafe, lap, Planner(copies, actor, critic, planned, followed), copies)
 
 
 def _forecasts(values: Mapping[str, Any], forecaster: Forecaster, fallen_height: float, rate: float) -> ForecastThread:
