@@ -127,7 +127,8 @@ def _estimates(
         failsafe = from_mapping(FailSafeSettings, settings["failsafe"], "conf/evaluate.yaml: failsafe")
         planner = planner_settings(settings.get("planner"))
         threads = int(settings["threads"])
-        result = evaluate_agent(agent, fragments, labels, "test", failsafe, contact, threads, planner=planner)
+        lookahead = int(settings["lookahead"]) if settings["causal"] else None
+        result = evaluate_agent(agent, fragments, labels, "test", failsafe, contact, threads, None, planner, lookahead)
         diverged = sum(one.estimate.diverged for one in result)
         survival = {"survival": _survival(agent, settings)} if job.survival else {}
         fallen = [int(one.estimate.fallen.sum()) for one in result]

@@ -101,6 +101,10 @@ def test_kappa_comes_from_the_command_line_or_the_runs_discount() -> None:
     unset = FailSafeSettings("value", None, 0.3)
     assert unset.for_run({"algo": {"gamma": 0.99}}).reset_threshold == pytest.approx(0.164, abs=5e-4)
     assert FailSafeSettings("value", 0.2, 0.3).for_run({}).reset_threshold == 0.2
+    tracked = {"algo": {"gamma": 0.97}, "task": {"reset_threshold": 0.25}}
+    assert unset.for_run(tracked).reset_threshold == 0.25
+    assert unset.for_run(tracked, planned=0.3).reset_threshold == 0.3
+    assert unset.for_run(tracked | {"task": {}}).reset_threshold == paper_threshold(0.97)
     with pytest.raises(ValueError, match="reset_threshold"):
         FailSafe(1, unset)
     with pytest.raises(InputError, match="gamma"):

@@ -51,7 +51,7 @@ def write_raw(job: Any, results: Path, **values: Any) -> None:
     path.write_text(json.dumps({"fingerprint": job.fingerprint, **values}))
 
 
-@pytest.mark.parametrize(("name", "least"), [("study.yaml", 50), ("large.yaml", 5)])
+@pytest.mark.parametrize(("name", "least"), [("study.yaml", 50), ("large.yaml", 5), ("people.yaml", 10)])
 def test_every_job_of_the_study_files_composes(name: str, least: int) -> None:
     from study import list_jobs
 

@@ -15,7 +15,7 @@ from egopose.evaluation import metrics
 from egopose.evaluation import resets as triggers
 from egopose.evaluation.agents import estimate_and_judge
 from egopose.evaluation.options import output_folder, physics_group
-from egopose.inference.failsafe import FailSafeSettings, paper_threshold
+from egopose.inference.failsafe import FailSafeSettings
 from egopose.inference.video_regression import require_estimation
 from egopose.pipeline.agent import Agent, load_agent
 
@@ -97,7 +97,9 @@ def choose_threshold(values: Mapping[str, Any]) -> str:
         raise InputError(_SOURCE, "threshold_search.tried", f"must be a list of numbers, not {thresholds!r}")
     agent = load_agent(str(values["checkpoint"]), None, str(values["which"]), physics_group(values["physics"]))
     require_estimation(agent.config, agent.path)
-    usual = round(paper_threshold(float(agent.config["algo"]["gamma"])), 3)
+    own = FailSafeSettings("value", None, 0.0).for_run(agent.config).reset_threshold
+    assert own is not None
+    usual = round(own, 3)
     window = int(values["failsafe_report"]["window"])
     rows = try_thresholds(agent, sorted({*thresholds, usual}), window, int(values["threads"]))
     folder = output_folder(None, agent.path, "train").parent if given is None else Path(str(given))

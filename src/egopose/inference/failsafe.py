@@ -58,14 +58,17 @@ class FailSafeSettings:
                 raise InputError("failsafe", name, f"{limit}; must be positive, and needs restart=path, or null")
 
     def for_run(self, config: Mapping[str, Any], planned: float | None = None) -> FailSafeSettings:
-        """With a threshold: its own, else ``planned`` (meant for a planner's values), else the paper's.
+        """With a threshold: its own, else ``planned`` (meant for a planner's values), else the one of the run's task
+        (``task.reset_threshold``), else the paper's, which depends on the run's discount.
 
-        The paper's depends on the discount of a run's ``config``."""
+        Args:
+            config: of the run, resolved.
+            planned: of a planner; None without one, or where it has none.
+        """
         if self.reset_threshold is not None:
             return self
-        return replace(
-            self, reset_threshold=paper_threshold(float(config["algo"]["gamma"])) if planned is None else planned
-        )
+        known = planned if planned is not None else config.get("task", {}).get("reset_threshold")
+        return replace(self, reset_threshold=paper_threshold(float(config["algo"]["gamma"])) if known is None else known)
 
 
 def paper_threshold(discount: float) -> float:

@@ -138,7 +138,7 @@ def _network_config(config: Mapping[str, Any]) -> dict[str, Any] | None:
 
 def _by_subject(config: Mapping[str, Any]) -> bool:
     """If people are held out for testing, cross-fitting holds out people too: F does far better on people it knows."""
-    return config["data"]["split"]["kind"] == "subject" and int(config["regressor"]["cross_fit"]) > 1
+    return config["data"]["split"]["kind"] in ("subject", "table") and int(config["regressor"]["cross_fit"]) > 1
 
 
 def _is_trained(store: TakeStore, name: str) -> bool:
