@@ -24,6 +24,7 @@ from egopose.checkpoint.checkpoint import (
     verify,
 )
 from egopose.core.errors import InputError
+from egopose.envs.target_window import window_size
 from egopose.envs.transforms import StateNormalizer
 from egopose.humanoid.config import HumanoidConfig
 from egopose.models.policy import PolicySettings, build_actor, build_critic
@@ -32,6 +33,7 @@ from egopose.pipeline.environment import build_env
 from egopose.pipeline.forecaster import with_forecasts
 from egopose.pipeline.networks import build_networks
 from egopose.tasks.dataset import Dataset
+from egopose.tasks.imitation import WINDOW
 from egopose.tasks.task import task_name, task_of
 
 _STORE_GROUPS = {"data", "humanoid"}
@@ -142,17 +144,18 @@ def load_policy(path: str | Path, which: str = "best") -> Policy:
     folder = find_checkpoint(path, which)
     config = read_json(folder, "config")
     settings = PolicySettings.from_config(config["model"])
-    if settings.context.source != "frozen":
+    if settings.context.source not in ("frozen", "none"):
         cause = f"{settings.context.source} reads the features of its data: load_agent brings both"
         raise InputError(folder, "model.context.source", cause)
     saved: dict[str, dict[str, Any]] = {"policy": {}, "transforms": {}}
     parts = {name: ComponentState(dict, state.update) for name, state in saved.items()}
     metadata = RunCheckpoint(parts).restore(folder, set(parts))
     normalizer = _normalizer(saved["transforms"], folder)
-    widths = _observation_widths(settings, saved["policy"], len(normalizer.mean), int(metadata["action_size"]), folder)
+    ahead, actions = len(config["task"].get("ahead", ())), int(metadata["action_size"])
+    widths = _observation_widths(settings, saved["policy"], len(normalizer.mean), actions, ahead, folder)
     joints = HumanoidConfig.from_mapping(config["humanoid"]).skeleton().joints
     names = [f"{joint.name}_{number}" for joint in joints for number in range(len(joint.dofs))]
-    actor = build_actor(settings, widths, int(metadata["action_size"]), dof_names=names)
+    actor = build_actor(settings, widths, actions, dof_names=names)
     critic = build_critic(settings, widths)
     RunCheckpoint({"policy": actor, "critic": critic}).restore(folder, {"policy", "critic"})
     return Policy(actor.eval(), critic.eval(), normalizer, config, folder)
@@ -170,7 +173,7 @@ def load_actor(path: str | Path, dataset: Dataset | None = None, which: str = "b
         InputError: see :func:`load_policy` and :func:`load_agent`.
     """
     folder = find_checkpoint(path, which)
-    if dataset is None and read_json(folder, "config")["model"]["context"]["source"] == "frozen":
+    if dataset is None and read_json(folder, "config")["model"]["context"]["source"] in ("frozen", "none"):
         return load_policy(folder).actor
     return load_agent(folder, dataset).actor
 
@@ -187,11 +190,15 @@ def _normalizer(state: Mapping[str, Any], folder: Path) -> StateNormalizer:
 
 
 def _observation_widths(
-    settings: PolicySettings, actor: Mapping[str, Any], state_size: int, action_size: int, folder: Path
+    settings: PolicySettings, actor: Mapping[str, Any], state_size: int, action_size: int, ahead: int, folder: Path
 ) -> dict[str, int]:
-    """The size of each observation's last axis; that of the visual context is the rest of the actor's first layer."""
+    """The size of each observation's last axis; that of a visual context is the rest of the actor's first layer.
+
+    ``ahead`` frames of the target motion are in the window of a policy that reads one.
+    """
     widths = {
         "humanoid_state": state_size,
+        WINDOW: window_size(action_size, ahead),
         "tracking_error": 2 * state_size,
         "followed_targets": action_size,
         "time_left": 1,
@@ -200,6 +207,8 @@ def _observation_widths(
     if unknown := set(settings.inputs) - set(widths):
         raise InputError(folder, "model.inputs", f"{sorted(unknown)[0]!r}: its width is not known without the data")
     known += sum(widths[key] for key in settings.inputs)
+    if settings.context.source == "none":
+        return widths
     first = next((value for key, value in actor.items() if key.endswith("mean.0.weight")), None)
     if first is None or first.ndim != 2 or first.shape[1] <= known:
         raise InputError(folder, "policy.mean.0.weight", "is no first layer of an actor of this configuration")
