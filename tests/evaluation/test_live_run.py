@@ -48,7 +48,7 @@ def test_a_motion_keeps_its_shape_where_it_is_begun(
     assert (turned[0].inv() * turned[1]).magnitude() < 1e-6
 
 
-@pytest.mark.parametrize("task, told", [("residual", False), ("tracked_estimation", True)])
+@pytest.mark.parametrize(("task", "told"), [("residual", False), ("tracked_estimation", True)])
 def test_a_policy_that_looks_ahead_is_told_of_the_look_ahead_without_a_planner(task: str, told: bool) -> None:
     trained = untrained("tracking" if told else "fast", task)
     regression = live_regression(trained, 4, None)
@@ -61,7 +61,7 @@ def test_a_policy_that_looks_ahead_is_told_of_the_look_ahead_without_a_planner(t
 
 
 @pytest.mark.parametrize(
-    "planner, restart, named",
+    ("planner", "restart", "named"),
     [("trajectory", "own", "planner=live"), ("none", "path", "failsafe: restart")],
 )
 def test_what_a_stream_lacks_is_refused(planner: str, restart: str, named: str) -> None:

@@ -68,7 +68,9 @@ class FailSafeSettings:
         if self.reset_threshold is not None:
             return self
         known = planned if planned is not None else config.get("task", {}).get("reset_threshold")
-        return replace(self, reset_threshold=paper_threshold(float(config["algo"]["gamma"])) if known is None else known)
+        return replace(
+            self, reset_threshold=paper_threshold(float(config["algo"]["gamma"])) if known is None else known
+        )
 
 
 def paper_threshold(discount: float) -> float:
