@@ -102,7 +102,7 @@ class ForecasterSettings:
         input_noise: deviations added to each context, one draw a number, and as much again a frame.
         other_weight: of the squared error, in deviations, of what E_pose does not see: height, root velocities, hands.
         cross_fit: forecasters for the training frames, each of which has not seen its own part of them: people where
-            people are held out for testing, else blocks of time.
+            people are held out for testing, else blocks of time. At 1 there are no forecasts of training frames.
         members: networks whose curves are averaged.
         total_frames: of motion each network learns from, counted as often as they are seen.
         kernel: of the kernel regression beside the networks, or None for networks alone.
@@ -140,7 +140,7 @@ class ForecasterSettings:
             settings = replace(settings, continued=continued)
         if settings.context > settings.horizon:  # what is left out about a block is as wide as the horizon
             raise InputError(source, "context", f"must be at most the horizon, {settings.horizon} frames")
-        least = {"recurrent": 1, "hidden": 1, "spacing": 1, "context": 1, "horizon": 2, "cross_fit": 2, "members": 1}
+        least = {"recurrent": 1, "hidden": 1, "spacing": 1, "context": 1, "horizon": 2, "cross_fit": 1, "members": 1}
         for name, value in least.items():
             if getattr(settings, name) < value:
                 raise InputError(source, name, f"must be at least {value}, not {getattr(settings, name)}")
