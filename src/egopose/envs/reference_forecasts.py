@@ -18,8 +18,6 @@ from egopose.models.pose_regression import integrated_path, state_to_qpos
 from egopose.motion import rotations as rot
 from egopose.motion.rotations import Array
 
-_TOGETHER = 256  # curves whose paths are worked out at once: 20 MB
-
 
 class ReferenceForecasts:
     """Humanoid states at every step of every curve; a step behind a curve's end is its last.
@@ -45,21 +43,22 @@ class ReferenceForecasts:
     ) -> None:
         self.horizon, self.frames, self._fps = horizon, frames, fps
         self.size = StateLayout.of_pose_size(coefficients.shape[-1]).size
-        self._paths: Tensor | None = None
         self._basis, self._slope = spline_basis(horizon + 1, spacing, fps)
         if coefficients.shape[:2] != (len(starts), self._basis.shape[1]):
             raise ValueError(f"curves {tuple(coefficients.shape)} of {len(starts)} starts do not fit the splines")
         if len(starts) and not 0 <= int(starts.min()) <= int(starts.max()) < frames:
             raise ValueError(f"curves begin outside the store's {frames} frames")
         self.coefficients, self.starts = coefficients.float(), starts.long()
+        self._paths = torch.zeros(len(starts), horizon + 1, 3, dtype=torch.float64)
+        self._has_path = torch.zeros(len(starts), dtype=torch.bool)
         self._row = torch.full((frames,), -1, dtype=torch.int64)
         self._row[self.starts] = torch.arange(len(starts))
 
     def put(self, coefficients: Tensor, starts: Tensor) -> None:
         """Other curves ``[R, K, P]`` for these starts ``[R]``; those of other starts stay."""
         kept = ~torch.isin(self.starts, starts)
-        if self._paths is not None:
-            self._paths = torch.cat([self._paths[kept], self._integrated(coefficients.float())])
+        self._paths = torch.cat([self._paths[kept], self._paths.new_zeros(len(starts), *self._paths.shape[1:])])
+        self._has_path = torch.cat([self._has_path[kept], self._has_path.new_zeros(len(starts))])
         self.coefficients = torch.cat([self.coefficients[kept], coefficients.float()])
         self.starts = torch.cat([self.starts[kept], starts.long()])
         self._row[self.starts] = torch.arange(len(self.starts))
@@ -76,11 +75,13 @@ class ReferenceForecasts:
     def path(self, start: Tensor, step: Tensor) -> Tensor:
         """``[N, 3]`` x, y (m) and heading (rad) of the root, float64; each curve from the origin and along x.
 
-        It is put together from the curve's own root velocities.
+        It is put together from the curve's own root velocities, once a curve.
         """
-        if self._paths is None:
-            self._paths = self._integrated(self.coefficients)
-        return self._paths[self._rows(start), step.clamp(max=self.horizon)]
+        row = self._rows(start)
+        if not bool(self._has_path[row].all()):
+            new = row[~self._has_path[row]].unique()
+            self._paths[new], self._has_path[new] = self._integrated(self.coefficients[new]), True
+        return self._paths[row, step.clamp(max=self.horizon)]
 
     def joint_velocities(self, start: Tensor, step: Tensor) -> Tensor:
         """``[N, D]`` rad/s."""
@@ -96,12 +97,9 @@ class ReferenceForecasts:
 
     def _integrated(self, coefficients: Tensor) -> Tensor:
         """``[R, horizon + 1, 3]`` the paths of curves ``[R, K, P]``."""
-        paths = [torch.zeros(0, self.horizon + 1, 3, dtype=torch.float64)]
-        for curves in coefficients.split(_TOGETHER):
-            poses = (self._basis @ curves).double().numpy()
-            still = np.zeros((*poses.shape[:2], self.size - poses.shape[2]))  # joint velocities move no root
-            paths.append(torch.from_numpy(integrated_path(np.concatenate([poses, still], axis=-1), self._fps)))
-        return torch.cat(paths)
+        poses = (self._basis @ coefficients).double().numpy()
+        still = np.zeros((*poses.shape[:2], self.size - poses.shape[2]))  # joint velocities move no root
+        return torch.from_numpy(integrated_path(np.concatenate([poses, still], axis=-1), self._fps))
 
     def _rows(self, start: Tensor) -> Tensor:
         row = self._row[start]

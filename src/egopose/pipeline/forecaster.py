@@ -76,7 +76,9 @@ def with_forecasts(config: Mapping[str, Any], dataset: Dataset, run: Path) -> Da
     if has_component(folder, "futures"):
         RunCheckpoint({"futures": ComponentState(dict, saved.update)}).restore(folder, {"futures"})
     else:  # shipped without those of its training frames: others are put in where a forecast begins
-        saved = _no_futures(settings, _size(dataset), _fps(dataset))
+        assert dataset.states is not None
+        knots, size = spline_basis(settings.horizon + 1, settings.spacing, _fps(dataset))[0].shape[1], _size(dataset)
+        saved = {"coefficients": torch.zeros(0, knots, size), "starts": torch.zeros(0, dtype=torch.int64)}
     return replace(dataset, forecasts=_futures(dataset, settings, saved["coefficients"], saved["starts"]))
 
 
@@ -130,11 +132,6 @@ def _fps(dataset: Dataset) -> float:
     return 1.0 / dataset.humanoid.control_dt
 
 
-def _no_futures(settings: ForecasterSettings, size: int, fps: float) -> dict[str, Tensor]:
-    knots = spline_basis(settings.horizon + 1, settings.spacing, fps)[0].shape[1]
-    return {"coefficients": torch.zeros(0, knots, size), "starts": torch.zeros(0, dtype=torch.int64)}
-
-
 def _futures(
     dataset: Dataset, settings: ForecasterSettings, coefficients: Tensor, starts: Tensor
 ) -> ReferenceForecasts:
@@ -166,7 +163,9 @@ def _train(config: Mapping[str, Any], dataset: Dataset, folder: Path) -> None:
         raise InputError("configuration", "forecaster", "needs a trained state regressor")
     settings, optimiser = _settings(config)
     if settings.cross_fit < 2 and config["training"]["total_steps"] != 0:
-        cause = f"{settings.cross_fit}: a policy that is trained needs forecasts of its training frames, 4 for instance"
+        cause = (
+            "1 is for training.total_steps=0: a policy would learn to trust forecasts by networks that know the future"
+        )
         raise InputError("conf/forecaster", "cross_fit", cause)
     store = TakeStore.open(store_folder(config))
     pieces = split_takes(store.takes, config["data"]["split"], "train", supported_only=False)
@@ -210,19 +209,19 @@ def _train(config: Mapping[str, Any], dataset: Dataset, folder: Path) -> None:
             made = replace(made, continued=continued, continued_share=continued_share(settings))
         return made
 
-    blocks: list[list[Span]] = []
-    if settings.cross_fit > 1:
+    whole = members(spans, "")
+    if settings.cross_fit < 2:
+        coefficients, begun = [_curves(whole, seen[starts])], [starts]
+    else:
         blocks = cross_fit_blocks(spans, settings.cross_fit)
         if config["data"]["split"]["kind"] == "subject":
             blocks = group_blocks(spans, [store.takes[piece.take].subject for piece in pieces], settings.cross_fit)
-    whole = members(spans, "")
-    none = _no_futures(settings, size, fps)
-    coefficients, begun = [none["coefficients"]], [none["starts"]]
-    for fold, (others, now) in enumerate(cross_fit_starts(spans, blocks, settings)):
-        if len(now):
-            fitted = members(others, f" without block {fold}")
-            coefficients.append(_curves(fitted, seen[now]))
-            begun.append(now)
+        coefficients, begun = [], []
+        for fold, (others, now) in enumerate(cross_fit_starts(spans, blocks, settings)):
+            if len(now):
+                fitted = members(others, f" without block {fold}")
+                coefficients.append(_curves(fitted, seen[now]))
+                begun.append(now)
     table = {"coefficients": torch.cat(coefficients), "starts": torch.cat(begun)}
     part = folder.with_name(f"{FOLDER}.part")
     shutil.rmtree(part, ignore_errors=True)

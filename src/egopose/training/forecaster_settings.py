@@ -102,7 +102,8 @@ class ForecasterSettings:
         input_noise: deviations added to each context, one draw a number, and as much again a frame.
         other_weight: of the squared error, in deviations, of what E_pose does not see: height, root velocities, hands.
         cross_fit: forecasters for the training frames, each of which has not seen its own part of them: people where
-            people are held out for testing, else blocks of time. At 1 there are no forecasts of training frames.
+            people are held out for testing, else blocks of time. 1: forecasters that have seen all, for a policy
+            that is not trained.
         members: networks whose curves are averaged.
         total_frames: of motion each network learns from, counted as often as they are seen.
         kernel: of the kernel regression beside the networks, or None for networks alone.
