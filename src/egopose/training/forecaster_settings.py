@@ -108,6 +108,7 @@ class ForecasterSettings:
         total_frames: of motion each network learns from, counted as often as they are seen.
         kernel: of the kernel regression beside the networks, or None for networks alone.
         continued: of the network beside both that goes on frame by frame, or None for none.
+        mass_ahead: m, see :func:`egopose.models.grounded_poses.grounded`; None for curves as the networks have them.
     """
 
     recurrent: int
@@ -124,6 +125,7 @@ class ForecasterSettings:
     total_frames: int
     kernel: KernelSettings | None = None
     continued: ContinuedSettings | None = None
+    mass_ahead: float | None = None
 
     @classmethod
     def from_config(cls, values: Mapping[str, Any], source: str = "conf/forecaster") -> ForecasterSettings:
