@@ -8,6 +8,7 @@ simulated body that follows this loses its balance. NumPy, float64, quaternions 
 from __future__ import annotations
 
 import numpy as np
+from scipy.ndimage import gaussian_filter1d
 
 from egopose.humanoid.foot_geometry import out_of_floor, sole_edges
 from egopose.humanoid.model import HumanoidModel
@@ -19,6 +20,8 @@ from egopose.motion.rotations import Array
 
 #: m above the lowest corner of a sole at which a corner carries 1/e as much.
 _CARRIES = 0.02
+#: s, a standard deviation in time: what the mass sways more quickly is left to it.
+_SWAY = 1.0 / 3.0
 #: m^2: corners this near together do not tell how the body turns.
 _SPREAD = 1e-3
 
@@ -26,7 +29,8 @@ _SPREAD = 1e-3
 def grounded(poses: Array, humanoid: HumanoidModel, mass_ahead: float) -> Array:
     """Poses ``[W, T, P]`` of W motions with the same joints and another root, float64.
 
-    In this order: the root leans so that the mass is above the soles that carry it. It rises until no sole is in the
+    In this order: the root leans so that the mass is above the soles that carry it, over some tenths of a second. It
+    rises until no sole is in the
     floor. Its velocities become those of its height and lean, and of soles that stay where they are.
 
     Args:
@@ -82,6 +86,7 @@ def _upright(poses: Array, humanoid: HumanoidModel, layout: StateLayout, mass_ah
     centre = centre.reshape(*qpos.shape[:2], 3)
     middle = (_shares(corners)[..., None] * corners[..., :2]).sum(axis=-2)
     away = centre[..., :2] - middle - np.array([mass_ahead, 0.0])
+    away = gaussian_filter1d(away, _SWAY / humanoid.control_dt, axis=1, mode="nearest")
     lean = away / (centre[..., 2] - corners[..., 2].min(axis=-1))[..., None]
     turn = rot.from_rotvec(np.stack([lean[..., 1], -lean[..., 0], np.zeros_like(lean[..., 0])], axis=-1))
     turned = rot.multiply(turn, qpos[..., 3:7])
