@@ -293,12 +293,12 @@ def forecasting_run(trained: Trained, tmp_path_factory: pytest.TempPathFactory) 
     return folder
 
 
-@pytest.fixture(scope="module")
-def following_run(trained: Trained, tmp_path_factory: pytest.TempPathFactory) -> Path:
+@pytest.fixture(scope="module", params=["forecasting_follow", "tracked_forecasting"])
+def following_run(request: Any, trained: Trained, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run directory of an untrained policy that follows kinematic forecasts, whose networks are untrained too."""
     folder = tmp_path_factory.mktemp("following")
     small = ["collector.num_envs=2", "algo.steps_per_iteration=16", "algo.minibatch_size=16", "logger=csv"]
-    config = compose_config("train", ["experiment=forecasting_follow", "regressor=fast", *small])
+    config = compose_config("train", [f"experiment={request.param}", "regressor=fast", *small])
     size = StateLayout(trained.humanoid.mj_model.nu).size
     weights = {"regressor": trained.regressor, "config": {"state_size": size, **config}}
     RunCheckpoint(weights).save(folder / "regressor", metadata=metadata_of("regressor", size, 1, 0, 0.0))

@@ -69,8 +69,8 @@ def test_a_leaning_body_that_stands_in_the_floor_stands_on_it_upright(humanoid: 
     qpos = in_the_world(out, humanoid)
     before, after = (mass_ahead(in_the_world(p, humanoid)[0], humanoid) for p in (poses, out))
     target = np.array([AHEAD, 0.0])
-    # A body turns about its soles' middle as well, which is where a foot tips to.
-    assert np.abs(after - target).max() < max(0.5 * np.abs(before - target).max(), 0.02)
+    # A sole turns with the body, so the middle of both moves a little.
+    assert np.abs(after - target).max() < max(0.5 * np.abs(before - target).max(), 0.015)
     soles = sole_edges(humanoid, Motion(humanoid.skeleton, qpos, FPS))
     np.testing.assert_allclose(soles[..., 2].min(axis=1), 0.0, atol=1e-9)
     np.testing.assert_allclose(out[..., layout.root_linear_velocity], 0.0, atol=1e-9)
@@ -84,7 +84,7 @@ def test_a_body_in_the_air_stays_there(humanoid: HumanoidModel) -> None:
 
 
 def test_soles_that_carry_stay_where_they_are(humanoid: HumanoidModel) -> None:
-    """Both legs swing, one bends: the root goes where the sole on the floor lets it."""
+    """Both legs swing, one bends: the root goes where the sole on the floor lets it, though that tips."""
     poses = swaying(humanoid, 0.05, 0.9, 0.25)
     soles = [
         sole_edges(humanoid, Motion(humanoid.skeleton, in_the_world(p, humanoid), FPS))
@@ -93,8 +93,7 @@ def test_soles_that_carry_stay_where_they_are(humanoid: HumanoidModel) -> None:
     low = soles[1][..., 2] < 0.01
     moved = [np.linalg.norm(np.diff(s[..., :2], axis=0), axis=-1)[low[1:] & low[:-1]].mean() * FPS for s in soles]
     assert low.any(axis=1).all()
-    assert moved[1] < 0.1 * moved[0]
-    assert moved[1] < 0.03
+    assert moved[1] < 0.15 * moved[0]
 
 
 def test_velocities_are_those_of_the_motion_itself(humanoid: HumanoidModel) -> None:

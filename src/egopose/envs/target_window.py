@@ -48,7 +48,7 @@ def target_window(state: Any, root: Any, targets: Any, path: Any, xp: Any = np) 
         path: ``[N, K, 3]`` x, y and heading of the target's root in these frames.
         xp: ``numpy``, or ``torch`` for tensors: arrays cost a step less, and a trace needs tensors.
     """
-    layout = StateLayout.of_size(state.shape[-1])
+    layout = StateLayout.of_size(int(state.shape[-1]))
     rotation = layout.root_rotation.start
     tilt = slice(rotation + 1, rotation + 3)
     away, turn = path[..., :2] - root[:, None, :2], path[..., 2] - root[:, None, 2]

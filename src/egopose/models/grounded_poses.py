@@ -18,7 +18,7 @@ from egopose.motion import rotations as rot
 from egopose.motion.motion import Motion
 from egopose.motion.rotations import Array
 
-#: m above the lowest corner of a sole at which a corner carries 1/e as much.
+#: m above the lowest point at which a point carries 1/e as much.
 _CARRIES = 0.02
 #: s, a standard deviation in time: what the mass sways more quickly is left to it.
 _SWAY = 1.0 / 3.0
@@ -30,8 +30,7 @@ def grounded(poses: Array, humanoid: HumanoidModel, mass_ahead: float) -> Array:
     """Poses ``[W, T, P]`` of W motions with the same joints and another root, float64.
 
     In this order: the root leans so that the mass is above the soles that carry it, over some tenths of a second. It
-    rises until no sole is in the
-    floor. Its velocities become those of its height and lean, and of soles that stay where they are.
+    rises until no sole is in the floor. Its velocities become those of its height and lean, and of soles that stay.
 
     Args:
         poses: z without the joint velocities, see :class:`~egopose.humanoid.state_layout.StateLayout`.
@@ -67,9 +66,9 @@ def _corners(qpos: Array, humanoid: HumanoidModel) -> Array:
     return edges.reshape(*qpos.shape[:2], *edges.shape[1:])
 
 
-def _shares(corners: Array) -> Array:
-    """``[W, T, C]`` how much of the body each corner carries, by its height."""
-    height = corners[..., 2] - corners[..., 2].min(axis=-1, keepdims=True)
+def _shares(points: Array) -> Array:
+    """``[W, T, C]`` how much of the body each of the ``points [W, T, C, 3]`` carries, by its height."""
+    height = points[..., 2] - points[..., 2].min(axis=-1, keepdims=True)
     shares = np.exp(-height / _CARRIES)
     return shares / shares.sum(axis=-1, keepdims=True)
 
@@ -84,7 +83,9 @@ def _upright(poses: Array, humanoid: HumanoidModel, layout: StateLayout, mass_ah
     mass = model.body_mass[ids] / model.body_mass[ids].sum()
     centre = mass @ (positions + rot.rotate(quats, np.broadcast_to(model.body_ipos[ids], positions.shape)))
     centre = centre.reshape(*qpos.shape[:2], 3)
-    middle = (_shares(corners)[..., None] * corners[..., :2]).sum(axis=-2)
+    # Of whole soles: a lean tips a sole, and which corner is lowest says which way, not how far.
+    soles = corners.reshape(*corners.shape[:2], len(humanoid.feet), -1, 3).mean(axis=-2)
+    middle = (_shares(soles)[..., None] * soles[..., :2]).sum(axis=-2)
     away = centre[..., :2] - middle - np.array([mass_ahead, 0.0])
     away = gaussian_filter1d(away, _SWAY / humanoid.control_dt, axis=1, mode="nearest")
     lean = away / (centre[..., 2] - corners[..., 2].min(axis=-1))[..., None]
