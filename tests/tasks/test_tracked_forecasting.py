@@ -81,7 +81,7 @@ def test_the_actors_own_mean_is_added_to_the_forecast() -> None:
     ("changes", "told"),
     [
         ({"model": group("model", "tracking")}, r"model\.base.*followed_targets"),
-        ({"model": group("model", "fast")}, "forecaster.*tracked_forecasting"),
+        ({"model": group("model", "paper")}, "forecaster.*tracked_forecasting"),
         ({"forecaster": None}, r"model\.inputs.*target_window knows the frames"),
         ({"task": {**group("task", "tracked_forecasting"), "follow": None}}, r"task\.follow.*is missing"),
         ({"task": group("task", "tracked_estimation")}, "forecaster.*tracked_forecasting"),
