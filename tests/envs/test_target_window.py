@@ -148,6 +148,8 @@ def test_at_a_takes_end_all_frames_ahead_are_its_last() -> None:
     entries = TensorDict(
         {
             "frame": frame,
+            "episode_start": frame,
+            "episode_step": torch.zeros_like(frame),
             "humanoid_state": problem.states[frame[:, 0]],
             "root_on_path": problem.path[frame[:, 0]].float(),
         },

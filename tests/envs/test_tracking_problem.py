@@ -98,12 +98,12 @@ def test_a_path_is_laid_where_a_body_is_placed() -> None:
 def test_only_worlds_that_begin_anew_lay_their_path() -> None:
     env = environment(4, problem=tracking_problem(0.2), seed=3)
     observation = env.reset()
-    laid = env._laid.clone()
+    laid = env.laid.clone()
     for _ in range(3):
         observation = env.step(observation.set("action", torch.zeros(env.action_spec.shape)))["next"].exclude("reward")
     mask = torch.tensor([[True], [False], [True], [False]])
     env.reset(TensorDict({"_reset": mask}, batch_size=[4]))
-    assert torch.equal(env._laid[1::2], laid[1::2])
+    assert torch.equal(env.laid[1::2], laid[1::2])
     torch.testing.assert_close(
         env.observe()["root_on_path"][::2, :2], env.problem.path[env.frame][::2, :2].float(), atol=1e-5, rtol=0
     )

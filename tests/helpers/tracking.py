@@ -55,6 +55,5 @@ def tracking_problem(
 
 def window_of(problem: TrackingProblem, ahead: tuple[int, ...]) -> TargetWindow:
     """What a policy sees of it."""
-    assert problem.states is not None
-    assert problem.path_followed is not None
-    return TargetWindow(problem.states, problem.path_followed, problem.takes.last(), ahead)
+    assert problem.motion_seen is not None
+    return TargetWindow(problem.motion_seen, ahead)

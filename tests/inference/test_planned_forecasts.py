@@ -21,10 +21,10 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from egopose.core.torch_settings import torch_threads
 from egopose.data.windows import ForecastWindow
-from egopose.envs.imitation import followed_forecasts
 from egopose.envs.mdp.observations import humanoid_state
 from egopose.envs.mdp.step_view import StepView
 from egopose.envs.reference_forecasts import ReferenceForecasts
+from egopose.envs.target_motion import CurveMotion
 from egopose.envs.test_time import prepare_for_test
 from egopose.evaluation import forecast_run as forecast_evaluation
 from egopose.evaluation.forecast_run import ForecastSettings, forecast_windows_of
@@ -105,13 +105,14 @@ def test_what_is_followed_is_every_step_of_every_curve(dataset: Dataset) -> None
     futures = dataset.forecasts
     assert futures is not None
     starts = torch.tensor([17, 3, 8])
-    states, row, path = followed_forecasts(futures, starts)
-    assert path is None
+    states, row, path = CurveMotion(futures).followed(starts)
+    assert path is not None
     assert states.shape == (3 * 13, dataset.states.shape[1])
     start, step = starts.repeat(20), torch.arange(20).repeat_interleave(3)
     rows = row({"episode_start": start[:, None], "episode_step": step[:, None], "frame": torch.zeros(60, 1).long()})
     assert rows.dtype == torch.int64
     assert torch.equal(states[rows], futures.states(start, step))
+    assert torch.equal(path[rows], futures.path(start, step))
     assert rows[:3].tolist() == [0, 13, 26]
     assert set(rows[step >= 12].tolist()) == {12, 25, 38}, "behind the horizon the last"
     stray = row({"episode_start": torch.tensor([[4]]), "episode_step": torch.tensor([[12]])})
@@ -252,7 +253,7 @@ def test_each_lot_of_windows_has_a_planner_that_follows_its_curves(agent: Agent,
     now = nows(agent, WINDOWS)
     for one, part in zip(made, (now[:2], now[2:]), strict=True):
         env, actor, critic, used, (states, row, path) = one.given
-        assert path is None
+        assert path is not None
         assert (actor, critic, used) == (agent.actor, agent.critic, chosen)
         assert env.batch_size == torch.Size([12 * len(part)])
         steps = torch.arange(13).repeat(len(part))

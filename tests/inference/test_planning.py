@@ -522,6 +522,12 @@ def test_what_cannot_be_planned_for_is_refused() -> None:
         Planner(env, actor(), critic(), settings(**SMALL), Followed(states, global_frame))
 
 
+def follow(problem: Any, states: Tensor) -> None:
+    """Let bodies follow ``states [F, S]`` and their own path."""
+    problem.states = states
+    problem.motion = problem._motion()
+
+
 def estimated_by(planner: PlannerSettings | None, made: Callable[[], None] = lambda: None) -> list[Estimate]:
     """What an evaluation makes of both takes; ``made`` is called when it makes an environment."""
 
@@ -530,7 +536,7 @@ def estimated_by(planner: PlannerSettings | None, made: Callable[[], None] = lam
         assert options == {"whole_fragments": True, "falls_end": False}
         assert list(fragments) == list(PIECES)
         env = frozen(make_env(num_envs, threads=threads))
-        env.base_env.problem.states = states
+        follow(env.base_env.problem, states)
         return env
 
     states = states_of(other_motion())
@@ -549,7 +555,7 @@ def estimated_by(planner: PlannerSettings | None, made: Callable[[], None] = lam
 def test_an_evaluation_plans_only_where_it_is_told_to() -> None:
     states = states_of(other_motion())
     problem = base_of(make_env(1)).problem
-    problem.states = states  # type: ignore[attr-defined]
+    follow(problem, states)
     path = problem.followed().path
     assert path is not None
     for planned, by_hand in (

@@ -24,7 +24,6 @@ from egopose.checkpoint.checkpoint import ComponentState, RunCheckpoint, metadat
 from egopose.core.config import compose_config
 from egopose.core.errors import InputError
 from egopose.core.torch_settings import torch_threads
-from egopose.envs.reference_forecasts import TrackForecast
 from egopose.humanoid.state_layout import StateLayout
 from egopose.inference.context_states import context_states
 from egopose.inference.forecaster import forecast
@@ -294,12 +293,12 @@ def forecasting_run(trained: Trained, tmp_path_factory: pytest.TempPathFactory) 
     return folder
 
 
-@pytest.fixture(scope="module")
-def following_run(trained: Trained, tmp_path_factory: pytest.TempPathFactory) -> Path:
+@pytest.fixture(scope="module", params=["forecasting_follow", "tracked_forecasting"])
+def following_run(request: Any, trained: Trained, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run directory of an untrained policy that follows kinematic forecasts, whose networks are untrained too."""
     folder = tmp_path_factory.mktemp("following")
     small = ["collector.num_envs=2", "algo.steps_per_iteration=16", "algo.minibatch_size=16", "logger=csv"]
-    config = compose_config("train", ["experiment=forecasting_follow", "regressor=fast", *small])
+    config = compose_config("train", [f"experiment={request.param}", "regressor=fast", *small])
     size = StateLayout(trained.humanoid.mj_model.nu).size
     weights = {"regressor": trained.regressor, "config": {"state_size": size, **config}}
     RunCheckpoint(weights).save(folder / "regressor", metadata=metadata_of("regressor", size, 1, 0, 0.0))
@@ -334,11 +333,11 @@ def test_a_run_that_follows_forecasts_live_what_it_does_offline(
     other = load_forecaster(values_of(*told, f"forecast.samples={max(samples - 1, 1)}"), trained)
     assert other is not None
     assert other.curves is not None
-    (follow,) = (part for part in other.env.transform if isinstance(part, TrackForecast))
     now, problem = torch.tensor([CONTEXT - 1]), other.env.base_env.problem
+    forecasts = problem.forecasts
     seen = context_states(other.regressor, torch.from_numpy(moment.flow), [0], CONTEXT).double()
-    follow.forecasts.put(other.curves(seen), now)
-    first = follow.forecasts.first_state(now, torch.from_numpy(moment.qpos)[None], problem.humanoid.joint_range)
+    forecasts.put(other.curves(seen), now)
+    first = forecasts.first_state(now, torch.from_numpy(moment.qpos)[None], problem.humanoid.joint_range)
     offline = forecast(other.env, other.actor, *first, samples, 20, seed=5 + moment.frame, noise_time=0.3)
     found = live.qpos[None] if samples == 1 else live.drawn
     np.testing.assert_allclose(found[:, :12], offline.qpos[0, :, :12], atol=1e-4)

@@ -252,7 +252,7 @@ def test_shipped_forecasters_bring_no_curves_of_training_and_forecast_the_same(
 
 def test_bad_settings_are_named() -> None:
     with pytest.raises(InputError, match="cross_fit"):
-        settings(cross_fit=1)
+        settings(cross_fit=0)
     with pytest.raises(InputError, match="context"):
         settings(context=13)
     with pytest.raises(InputError, match="fragments"):

@@ -22,6 +22,7 @@ from egopose.envs.mdp.path import lay, on_path, root_on_floor
 from egopose.envs.mdp.step_view import StepView
 from egopose.envs.problem import Problem
 from egopose.envs.starts import Starts
+from egopose.envs.target_motion import present_path
 
 
 class HumanoidPhysics(dm_mujoco.Physics):
@@ -84,8 +85,10 @@ class EgoPoseTask(control.Task):
         qpos, qvel = self.problem.first_state(self._frame)
         physics.data.qpos[:], physics.data.qvel[:] = qpos[0].numpy(), qvel[0].numpy()
         self._placed = qpos[:, 7:]
-        if (path := self.problem.path_followed) is not None:
-            self._laid = lay(path[self._frame], root_on_floor(qpos))
+        if (motion := self.problem.motion_seen) is not None:
+            frame = self._frame[:, None]
+            clock = {"frame": frame, "episode_start": frame, "episode_step": torch.zeros_like(frame)}
+            self._laid = lay(present_path(motion, clock), root_on_floor(qpos))
         physics.diverged = False
 
     def before_step(self, action: NDArray[np.floating] | Tensor, physics: HumanoidPhysics) -> None:
@@ -100,7 +103,7 @@ class EgoPoseTask(control.Task):
     def get_observation(self, physics: HumanoidPhysics) -> OrderedDict[str, NDArray[Any]]:
         state = self._body_state(physics)
         seen = {key: value[0].numpy() for key, value in self.problem.observations(state, self._frame).items()}
-        if self.problem.path_followed is not None:
+        if self.problem.motion_seen is not None:
             seen["root_on_path"] = on_path(self._laid, root_on_floor(state["qpos"]))[0].numpy()
         return OrderedDict(**seen, frame=self._frame.numpy().copy())
 

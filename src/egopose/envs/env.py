@@ -19,6 +19,7 @@ from egopose.envs.mdp.path import lay, on_path, root_on_floor
 from egopose.envs.mdp.step_view import Contacts, StepView
 from egopose.envs.problem import BODY_KEYS, Problem
 from egopose.envs.starts import Starts
+from egopose.envs.target_motion import present_path
 from egopose.humanoid.physics import ALL, Array, BatchedPhysics, Indices
 
 Counter = NDArray[np.int64]
@@ -149,7 +150,7 @@ class EgoPoseEnv(EnvBase):
         self._take, self._start, self._stop, self._frame = np.zeros((4, num_envs), dtype=np.int64)
         self.placed = torch.zeros(num_envs, humanoid.mj_model.nu, dtype=torch.float64)
         self._targets = torch.zeros(num_envs, humanoid.mj_model.nu, dtype=torch.float64)
-        self._laid = torch.zeros(num_envs, 3, dtype=torch.float64)  # see egopose.envs.mdp.path
+        self.laid = torch.zeros(num_envs, 3, dtype=torch.float64)  # see egopose.envs.mdp.path
         self._unrewarded: list[_Unrewarded] | None = None
         self._earnings: list[Tensor] = []
         self._no_flags = _no_flags(problem.endings, self.batch_size)
@@ -162,7 +163,7 @@ class EgoPoseEnv(EnvBase):
         whole, flag = Unbounded((n, 1), dtype=torch.int64), Binary(1, (n, 1), dtype=torch.bool)
         self.observation_spec = Composite(
             **{k: Unbounded((n, size), dtype=torch.float32) for k, size in self.problem.observation_sizes.items()},
-            **({} if self.problem.path_followed is None else {"root_on_path": Unbounded((n, 3), dtype=torch.float32)}),
+            **({} if self.problem.motion_seen is None else {"root_on_path": Unbounded((n, 3), dtype=torch.float32)}),
             frame=whole.clone(),
             episode_start=whole.clone(),
             episode_stop=whole.clone(),
@@ -283,8 +284,8 @@ class EgoPoseEnv(EnvBase):
         self.physics.set_state(worlds.numpy(), qpos.double().numpy(), qvel.double().numpy())
         if self.problem.remembers_start:
             self.placed[worlds] = qpos[:, 7:].double()
-        if (path := self.problem.path_followed) is not None:
-            self._laid[worlds] = lay(path[torch.from_numpy(self._frame)[worlds]], root_on_floor(qpos.double()))
+        if (motion := self.problem.motion_seen) is not None:
+            self.laid[worlds] = lay(present_path(motion, self._clock(worlds.numpy())), root_on_floor(qpos.double()))
 
     def observe(self, worlds: Tensor | slice = ALL) -> TensorDict:
         """The present observation of ``worlds [n]`` (default all), as a reset would return it (after :meth:`place`)."""
@@ -306,9 +307,9 @@ class EgoPoseEnv(EnvBase):
         self, state: BodyState | BodyView, frame: Tensor, worlds: NDArray[np.integer] | slice = ALL
     ) -> dict[str, Tensor]:
         seen = {key: value.float() for key, value in self.problem.observations(state, frame).items()}
-        if self.problem.path_followed is not None:
+        if self.problem.motion_seen is not None:
             qpos = state.qpos if isinstance(state, BodyView) else state["qpos"]
-            seen["root_on_path"] = on_path(self._laid[worlds], root_on_floor(qpos)).float()
+            seen["root_on_path"] = on_path(self.laid[worlds], root_on_floor(qpos)).float()
         return seen
 
     def ongoing(self, after: Mapping[Any, Any], worlds: slice = ALL) -> dict[str, Tensor]:
@@ -429,7 +430,7 @@ class EgoPoseEnv(EnvBase):
             "stop": torch.from_numpy(self._stop.copy()),
             "frame": torch.from_numpy(self._frame.copy()),
             **({"placed": self.placed.clone()} if self.problem.remembers_start else {}),
-            **({} if self.problem.path_followed is None else {"laid": self._laid.clone()}),
+            **({} if self.problem.motion_seen is None else {"laid": self.laid.clone()}),
             **self.starts.state_dict(),
         }
 
@@ -447,8 +448,8 @@ class EgoPoseEnv(EnvBase):
         )
         if self.problem.remembers_start:
             self.placed = state_dict["placed"].clone()
-        if self.problem.path_followed is not None:
-            self._laid = state_dict["laid"].clone()
+        if self.problem.motion_seen is not None:
+            self.laid = state_dict["laid"].clone()
         self.starts.load_state_dict(state_dict)
 
     def close(self, *, raise_if_closed: bool = True) -> None:

@@ -14,8 +14,9 @@ from egopose.envs.mdp import terminations
 from egopose.envs.mdp.observations import BodyLayout, BodyState, BodyView, humanoid_state_rows
 from egopose.envs.mdp.rewards import RewardTable
 from egopose.envs.mdp.step_view import Contacts, StepView
-from egopose.envs.problem import BODY_KEYS, Followed, Scene, TakeTable, global_frame
+from egopose.envs.problem import BODY_KEYS, Followed, Scene, TakeTable, TargetMotion
 from egopose.envs.reference_forecasts import ReferenceForecasts
+from egopose.envs.target_motion import CurveMotion, TableMotion
 from egopose.humanoid.model import HumanoidModel
 from egopose.humanoid.torques import torque_driven
 from egopose.models.pose_regression import integrated_path
@@ -77,8 +78,9 @@ class ImitationProblem:
         reward: see :class:`~egopose.envs.mdp.rewards.RewardTable`.
         action, termination: settings.
         action_reference: ``[F, nu]`` rad, the base target for reaching each frame; needed by ``regressor``.
-        forecasts: kinematic forecasts: episodes begin in their first states in place of the reference's.
-        states: ``[F, 2 nq - 3]`` humanoid states that bodies follow at test time, or None.
+        forecasts: kinematic forecasts that bodies follow: episodes begin in their first states in place of the
+            reference's.
+        states: ``[F, 2 nq - 3]`` humanoid states that bodies follow where there are no forecasts, or None.
         path: ``[F, 3]`` x, y (m) and heading (rad) of the root that they follow with the states; None for the path that
             the states' own velocities give.
         shows_path: observations hold the root in the path's axes.
@@ -123,7 +125,6 @@ class ImitationProblem:
         self.endings: tuple[str, ...] = ("fallen",)
         self.ends_episode: frozenset[str] = frozenset(self.endings) if termination.enabled else frozenset()
         self.remembers_start = action.reference == "start"
-        self.path_followed: Tensor | None = None
         self.actions_move_targets = action.kind == "pd"
         self.watched: frozenset[str] = reward.needs
         self.n_frames = reference.shape[0]
@@ -137,8 +138,8 @@ class ImitationProblem:
         whole = BodyView(self.reference_at(torch.arange(self.n_frames)), self.layout)
         self._qpos, self._qvel = whole.qpos, whole.qvel
         self._rewarded = {name: getattr(whole, name).contiguous() for name in reward.reads}
-        if shows_path:
-            self.path_followed = self.followed().path
+        self.motion = self._motion()
+        self.motion_seen: TargetMotion | None = self.motion if shows_path else None
         self._range = torch.as_tensor(humanoid.joint_range, dtype=torch.float64).T
         self._rest = torch.as_tensor(humanoid.rest_action, dtype=torch.float64)
         self._table: Tensor | None = None
@@ -242,16 +243,19 @@ class ImitationProblem:
     def followed(self, starts: Tensor | None = None) -> Followed:
         """What bodies follow: the forecasts that begin at ``starts [W]``, each once, or the states of every frame.
 
-        Forecasts have no path.
-
         Raises:
             ValueError: there is nothing to follow.
         """
-        if self.forecasts is not None and starts is not None:
-            return followed_forecasts(self.forecasts, starts)
-        if self.states is None:
+        if self.motion is None:
             raise ValueError("there is no state regressor whose states bodies could follow")
-        return Followed(self.states, global_frame, self._integrated() if self.path is None else self.path.double())
+        return self.motion.followed(starts)
+
+    def _motion(self) -> TargetMotion | None:
+        if self.forecasts is not None:
+            return CurveMotion(self.forecasts)
+        if self.states is None:
+            return None
+        return TableMotion(self.states, self._integrated() if self.path is None else self.path, self.takes.last())
 
     def _integrated(self) -> Tensor:
         """``[F, 3]`` the path of :attr:`states`, each take from the origin and along x."""
@@ -262,26 +266,3 @@ class ImitationProblem:
             rows = self.states[offset : offset + length].double().numpy()
             path[offset : offset + length] = torch.from_numpy(integrated_path(rows, 1.0 / self.humanoid.control_dt))
         return path
-
-
-def followed_forecasts(forecasts: ReferenceForecasts, starts: Tensor) -> Followed:
-    """What bodies follow that follow the forecasts from these frames.
-
-    Args:
-        forecasts: see :class:`~egopose.envs.reference_forecasts.ReferenceForecasts`.
-        starts: ``[W]`` global frames, each once.
-
-    Returns:
-        States z ``[W * (horizon + 1), S]`` of every step, and the row of a body in its episode; behind the horizon the
-        last.
-    """
-    steps = torch.arange(forecasts.horizon + 1)
-    states = forecasts.states(starts.repeat_interleave(len(steps)), steps.repeat(len(starts)))
-    number = torch.full((forecasts.frames,), -1, dtype=torch.int64)
-    number[starts] = torch.arange(len(starts))
-
-    def row(entries: Mapping[str, Tensor]) -> Tensor:
-        start, step = entries["episode_start"].squeeze(-1), entries["episode_step"].squeeze(-1)
-        return number[start] * len(steps) + step.clamp(max=forecasts.horizon)
-
-    return Followed(states, row)

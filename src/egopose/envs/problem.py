@@ -6,7 +6,9 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from egopose.envs.mdp.observations import BodyState, BodyView
@@ -37,7 +39,7 @@ class Scene(NamedTuple):
 
 
 class Followed(NamedTuple):
-    """The target motion of bodies at test time, when the truth is not known.
+    """The target motion of bodies at test time, when the truth is not known, as a table.
 
     Attributes:
         states: ``[R, 2 nq - 3]`` humanoid states.
@@ -49,6 +51,31 @@ class Followed(NamedTuple):
     states: Tensor
     row: Rows
     path: Tensor | None = None
+
+
+class TargetMotion(Protocol):
+    """The motion that N bodies follow, some frames ahead of where each body is in it.
+
+    ``entries`` are an environment's: ``frame``, ``episode_start`` and ``episode_step``, ``[N, 1]`` int64 each. ``ahead
+    [K]`` int64 are frames; behind the motion's end its last frame stands still.
+
+    Attributes:
+        size: S, numbers of a humanoid state.
+    """
+
+    size: int
+
+    def states(self, entries: Mapping[str, Tensor], ahead: NDArray[np.int64]) -> NDArray[np.float32]:
+        """Humanoid states ``[N, K, S]``."""
+        ...
+
+    def path(self, entries: Mapping[str, Tensor], ahead: NDArray[np.int64]) -> NDArray[np.float64]:
+        """``[N, K, 3]`` x, y (m) and heading (rad) of the root, in a world of the motion's own."""
+        ...
+
+    def followed(self, starts: Tensor | None = None) -> Followed:
+        """The motion of bodies whose episodes begin at global frames ``[W]``, each once; None for all of it."""
+        ...
 
 
 def global_frame(entries: Mapping[str, Tensor]) -> Tensor:
@@ -93,8 +120,8 @@ class Problem(Protocol):
         endings: names of what :meth:`ended` gives.
         ends_episode: those of them that end an episode.
         remembers_start: whether targets depend on the joint angles a body was placed with.
-        path_followed: ``[F, 3]`` x, y (m) and heading (rad) of the path that observations compare the root with; None
-            where they do not. See :mod:`egopose.envs.mdp.path`.
+        motion_seen: the target motion whose path observations compare the root with; None where they do not. See
+            :mod:`egopose.envs.mdp.path`.
         actions_move_targets: whether an action is added to PD targets; False where it is a torque.
         watched: the parts of a step beyond the body that rewards or endings read, of
             :data:`egopose.envs.mdp.rewards.PARTS`.
@@ -107,7 +134,7 @@ class Problem(Protocol):
     endings: tuple[str, ...]
     ends_episode: frozenset[str]
     remembers_start: bool
-    path_followed: Tensor | None
+    motion_seen: TargetMotion | None
     actions_move_targets: bool
     watched: frozenset[str]
 

@@ -91,34 +91,38 @@ def state_to_qpos(
 
 
 def integrate_root(parts: StateParts, position: Array, heading: Array, fps: float) -> tuple[Array, Array]:
-    """Horizontal position ``[T, 2]`` (m) and heading quaternion ``[T, 4]`` of the root from its velocities.
+    """Horizontal position ``[..., T, 2]`` (m) and heading quaternion ``[..., T, 4]`` of the root from its velocities.
 
     Each step turns the root by its angular velocity for 1/fps and keeps the heading of the result; roll and pitch stay
     those of the states. Exact for velocities that are forward differences at the same rate.
 
     Args:
-        parts: of T states.
+        parts: of T states ``[..., T]``.
         position: ``[2]`` m at the first frame.
         heading: ``[4]`` at the first frame.
         fps: frames per second.
     """
     turned = rot.heading(rot.multiply(parts.deheaded, rot.from_rotvec(parts.angular_velocity / fps)))
-    turn = 2.0 * np.arctan2(turned[:, 3], turned[:, 0])
-    yaw = 2.0 * np.arctan2(heading[3], heading[0]) + np.concatenate([[0.0], np.cumsum(turn[:-1])])
+    turn = 2.0 * np.arctan2(turned[..., 3], turned[..., 0])
+    yaw = 2.0 * np.arctan2(heading[3], heading[0]) + _summed(turn[..., None])[..., 0]
     headings = rot.from_axis_angle(np.array([0.0, 0.0, 1.0]), yaw)
-    steps = rot.rotate(headings, parts.linear_velocity)[:-1, :2] / fps
-    return np.concatenate([np.zeros((1, 2)), np.cumsum(steps, axis=0)]) + position, headings
+    return _summed(rot.rotate(headings, parts.linear_velocity)[..., :2] / fps) + position, headings
+
+
+def _summed(steps: Array) -> Array:
+    """Of ``steps [..., T, d]`` the sum of those before each frame."""
+    return np.concatenate([np.zeros_like(steps[..., :1, :]), np.cumsum(steps[..., :-1, :], axis=-2)], axis=-2)
 
 
 def integrated_path(state: Array, fps: float) -> Array:
-    """``[T, 3]`` x, y (m) and heading (rad, without jumps of a whole turn) of the root, by :func:`integrate_root`.
+    """``[..., T, 3]`` x, y (m) and heading (rad, no jumps of a whole turn) of the root, by :func:`integrate_root`.
 
     Args:
-        state: z ``[T, 11 + 2 D]`` of a take; its first frame is at the origin and faces along x.
+        state: z ``[..., T, 11 + 2 D]`` of takes; their first frames are at the origin and face along x.
         fps: frames per second.
     """
     positions, headings = integrate_root(split_state(state), np.zeros(2), np.array([1.0, 0.0, 0.0, 0.0]), fps)
-    return np.column_stack([positions, np.unwrap(rot.yaw(headings))])
+    return np.concatenate([positions, np.unwrap(rot.yaw(headings))[..., None]], axis=-1)
 
 
 def pose_regression(

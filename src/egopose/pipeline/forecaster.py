@@ -25,7 +25,9 @@ from egopose.data.splits import split_takes
 from egopose.data.store import TakeStore
 from egopose.envs.mdp.observations import humanoid_state
 from egopose.envs.reference_forecasts import ReferenceForecasts
+from egopose.humanoid.model import HumanoidModel
 from egopose.humanoid.state_layout import StateLayout
+from egopose.models.grounded_poses import grounded
 from egopose.models.mirror import state_mirror
 from egopose.models.motion_forecast import ContinuedForecaster, KernelForecaster, MotionForecaster, spline_basis
 from egopose.pipeline.regressor import training_contexts
@@ -112,9 +114,10 @@ class ForecastCurves:
         settings, _ = _settings(config)
         self.context, self._size = settings.context, _size(dataset)
         self._members = _members(settings, run / FOLDER, self._size, _fps(dataset))
+        self._settings, self._humanoid = settings, dataset.humanoid
 
     def __call__(self, pasts: Tensor) -> Tensor:
-        return _curves(self._members, pasts[..., : self._size].float())
+        return _curves(self._members, pasts[..., : self._size].float(), self._settings, self._humanoid)
 
 
 def _settings(config: Mapping[str, Any]) -> tuple[ForecasterSettings, FitSettings]:
@@ -140,9 +143,17 @@ def _futures(
 
 
 @torch.no_grad()
-def _curves(members: Members, contexts: Tensor) -> Tensor:
-    """Curve of the members ``[W, K, P]`` from contexts ``[W, C, P]``, in the pose's own units."""
-    return torch.cat([_curve(members, part) for part in contexts.split(512)])
+def _curves(members: Members, contexts: Tensor, settings: ForecasterSettings, humanoid: HumanoidModel) -> Tensor:
+    """Curve of the members ``[W, K, P]`` from contexts ``[W, C, P]``, in the pose's own units, grounded if asked."""
+    basis = spline_basis(settings.horizon + 1, settings.spacing, 1.0 / humanoid.control_dt)[0]
+    out = []
+    for part in contexts.split(512):
+        curve = _curve(members, part)
+        if settings.mass_ahead is not None:
+            poses = grounded((basis @ curve).double().numpy(), humanoid, settings.mass_ahead)
+            curve = torch.linalg.pinv(basis.double()).matmul(torch.from_numpy(poses)).float()
+        out.append(curve)
+    return torch.cat(out)
 
 
 def _curve(members: Members, contexts: Tensor) -> Tensor:
@@ -162,6 +173,11 @@ def _train(config: Mapping[str, Any], dataset: Dataset, folder: Path) -> None:
     if dataset.states is None:
         raise InputError("configuration", "forecaster", "needs a trained state regressor")
     settings, optimiser = _settings(config)
+    if settings.cross_fit < 2 and config["training"]["total_steps"] != 0:
+        cause = (
+            "1 is for training.total_steps=0: a policy would learn to trust forecasts by networks that know the future"
+        )
+        raise InputError("conf/forecaster", "cross_fit", cause)
     store = TakeStore.open(store_folder(config))
     pieces = split_takes(store.takes, config["data"]["split"], "train", supported_only=False)
     spans = [Span(*span) for span in global_spans(store, pieces)]
@@ -204,16 +220,19 @@ def _train(config: Mapping[str, Any], dataset: Dataset, folder: Path) -> None:
             made = replace(made, continued=continued, continued_share=continued_share(settings))
         return made
 
-    blocks = cross_fit_blocks(spans, settings.cross_fit)
-    if config["data"]["split"]["kind"] == "subject":
-        blocks = group_blocks(spans, [store.takes[piece.take].subject for piece in pieces], settings.cross_fit)
     whole = members(spans, "")
-    coefficients, begun = [], []
-    for fold, (others, now) in enumerate(cross_fit_starts(spans, blocks, settings)):
-        if len(now):
-            fitted = members(others, f" without block {fold}")
-            coefficients.append(_curves(fitted, seen[now]))
-            begun.append(now)
+    if settings.cross_fit < 2:
+        coefficients, begun = [_curves(whole, seen[starts], settings, dataset.humanoid)], [starts]
+    else:
+        blocks = cross_fit_blocks(spans, settings.cross_fit)
+        if config["data"]["split"]["kind"] == "subject":
+            blocks = group_blocks(spans, [store.takes[piece.take].subject for piece in pieces], settings.cross_fit)
+        coefficients, begun = [], []
+        for fold, (others, now) in enumerate(cross_fit_starts(spans, blocks, settings)):
+            if len(now):
+                fitted = members(others, f" without block {fold}")
+                coefficients.append(_curves(fitted, seen[now], settings, dataset.humanoid))
+                begun.append(now)
     table = {"coefficients": torch.cat(coefficients), "starts": torch.cat(begun)}
     part = folder.with_name(f"{FOLDER}.part")
     shutil.rmtree(part, ignore_errors=True)

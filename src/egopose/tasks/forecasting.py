@@ -13,11 +13,14 @@ from egopose.data.fragments import FragmentLike
 from egopose.envs.forecasting_transforms import TimeLeft
 from egopose.envs.mdp.observations import humanoid_state
 from egopose.envs.problem import Problem
-from egopose.envs.reference_forecasts import TrackForecast
+from egopose.envs.reference_forecasts import ForecastTargets, ReferenceForecasts, TrackForecast
 from egopose.envs.starts import Starts, after_context
 from egopose.envs.transforms import StateNormalizer
 from egopose.tasks.dataset import Dataset
-from egopose.tasks.imitation import ImitationTask, training_deviation
+from egopose.tasks.imitation import WINDOW, ImitationTask, target_window_of, training_deviation
+
+#: What the actions of a policy that follows a forecast are added to, see :class:`ForecastTargets`.
+TARGETS = "followed_targets"
 
 
 class Forecasting(ImitationTask):
@@ -33,26 +36,31 @@ class Forecasting(ImitationTask):
         """Raises InputError: the policy would see the future."""
         task, model = config["task"], config["model"]
         if config.get("forecaster") is not None:  # these replace the regressor, and depend on the context alone
-            if task["action"]["reference"] != "rest" or model["context"]["source"] != "frozen":
-                cause = "a forecaster is for task=forecasting_follow model=forecasting_follow"
-                raise InputError("configuration", "forecaster", cause)
+            _check_followed(task, model)
             return
         if task["action"]["reference"] == "regressor":
             raise InputError("configuration", "task.action.reference", "regressor knows the frames to be forecast")
-        if "tracking_error" in model["inputs"]:
-            raise InputError("configuration", "model.inputs", "tracking_error knows the frames to be forecast")
+        for key in ("tracking_error", WINDOW):
+            if key in model["inputs"]:
+                raise InputError("configuration", "model.inputs", f"{key} knows the frames to be forecast")
         context = model["context"]
         if context["source"] != "past" or int(context["horizon"]) > self.context(config):
             cause = f"a forecast sees the past {task['context']} frames only: model=forecasting"
             raise InputError("configuration", "model.context", cause)
 
     def transforms(self, config: Mapping[str, Any], dataset: Dataset, problem: Problem) -> list[Transform]:
-        """The kinematic forecast, if there is one, the state's normaliser and the time left."""
+        """What the policy sees of a kinematic forecast, if there is one, the state's normaliser and the time left."""
         time_left = TimeLeft(int(config["task"]["horizon"]) - 1)
         if dataset.forecasts is None:
             return [*super().transforms(config, dataset, problem), time_left]
+        model, shown = config["model"], list[Transform]()
+        if model["context"]["source"] == "frozen":
+            shown.append(_track_forecast(config, dataset, dataset.forecasts))
+        if WINDOW in model["inputs"]:
+            shown.append(target_window_of(config, problem))
         normalizer = StateNormalizer(problem.observation_sizes["humanoid_state"])
-        return [_track_forecast(config, dataset), normalizer, time_left]
+        # The targets come last: so runs from before they were a transform of their own still load.
+        return [*shown, normalizer, time_left, _forecast_targets(config, dataset, dataset.forecasts)]
 
     def starts(
         self, config: Mapping[str, Any], problem: Problem, fragments: Sequence[FragmentLike], whole_fragments: bool
@@ -63,22 +71,39 @@ class Forecasting(ImitationTask):
         return super().starts(config, problem, pieces, whole_fragments)
 
 
-def _track_forecast(config: Mapping[str, Any], dataset: Dataset) -> TrackForecast:
-    """The policy's observations of the forecasts it follows, as ``task.follow`` says."""
-    assert dataset.forecasts is not None
-    task, humanoid = config["task"], dataset.humanoid
+def _check_followed(task: Mapping[str, Any], model: Mapping[str, Any]) -> None:
+    """Raises InputError: a policy with these settings cannot follow a kinematic forecast."""
+    source, windowed = model["context"]["source"], WINDOW in model["inputs"]
+    if task["action"]["reference"] != "rest" or source not in ("frozen", "none") or (source == "none") != windowed:
+        cause = "a forecaster is for experiment=forecasting_follow or tracked_forecasting: their task and their model"
+        raise InputError("configuration", "forecaster", cause)
+    if model.get("base") != TARGETS:
+        cause = f"a policy that follows a forecast adds its actions to {TARGETS}, not to {model.get('base')}"
+        raise InputError("configuration", "model.base", cause)
     if not isinstance(task.get("follow"), Mapping):
-        raise InputError("configuration", "task.follow", "is missing: a forecaster is for task=forecasting_follow")
-    lag = torch.as_tensor(humanoid.kd / humanoid.kp) * float(task["follow"]["velocity_feedforward"])
-    floor = float(config["forecaster"]["std_floor"])
+        cause = "is missing: a forecaster is for task=forecasting_follow or tracked_forecasting"
+        raise InputError("configuration", "task.follow", cause)
+
+
+def _track_forecast(config: Mapping[str, Any], dataset: Dataset, forecasts: ReferenceForecasts) -> TrackForecast:
+    """The policy's observations of the forecasts it follows, as ``task.follow`` says."""
+    follow, floor = config["task"]["follow"], float(config["forecaster"]["std_floor"])
+    for name in ("error_clip", "ahead"):
+        if name not in follow:
+            raise InputError("configuration", f"task.follow.{name}", "is missing: task=forecasting_follow")
     return TrackForecast(
-        dataset.forecasts,
+        forecasts,
         training_deviation(humanoid_state(dataset.reference).float(), dataset, floor),
-        torch.as_tensor(humanoid.rest_action),
-        lag,
-        float(task["follow"]["error_clip"]),
-        [int(step) for step in task["follow"]["ahead"]],
+        float(follow["error_clip"]),
+        [int(step) for step in follow["ahead"]],
     )
+
+
+def _forecast_targets(config: Mapping[str, Any], dataset: Dataset, forecasts: ReferenceForecasts) -> ForecastTargets:
+    """What the policy's actions are added to, as ``task.follow`` says."""
+    humanoid, share = dataset.humanoid, float(config["task"]["follow"]["velocity_feedforward"])
+    lag = torch.as_tensor(humanoid.kd / humanoid.kp) * share
+    return ForecastTargets(forecasts, torch.as_tensor(humanoid.rest_action), lag)
 
 
 TASK = Forecasting()

@@ -72,20 +72,12 @@ class ImitationTask:
         normaliser."""
         transforms: list[Transform] = [StateNormalizer(problem.observation_sizes["humanoid_state"])]
         if WINDOW in config["model"]["inputs"]:
-            transforms.insert(0, self._window(config, dataset, problem))
+            transforms.insert(0, target_window_of(config, problem))
         if config["model"]["context"]["source"] == "frozen":
             if dataset.visual_context is None:
                 raise InputError("configuration", "model.context.source", "frozen needs a trained state regressor")
             transforms.insert(0, VisualContext(dataset.visual_context))
         return transforms
-
-    def _window(self, config: Mapping[str, Any], dataset: Dataset, problem: Problem) -> TargetWindow:
-        if dataset.states is None or problem.path_followed is None:
-            raise InputError("configuration", "model.inputs", f"{WINDOW} needs states to follow and their path")
-        ahead = tuple(int(frames) for frames in config["task"].get("ahead", ()))
-        if not ahead or min(ahead) < 1:
-            raise InputError("configuration", "task.ahead", f"{WINDOW} needs frames ahead of the body, not {ahead}")
-        return TargetWindow(dataset.states, problem.path_followed, dataset.takes.last(), ahead)
 
     def starts(
         self, config: Mapping[str, Any], problem: Problem, fragments: Sequence[FragmentLike], whole_fragments: bool
@@ -105,3 +97,17 @@ def training_deviation(states: torch.Tensor, dataset: Dataset, floor: float) -> 
     offsets = dataset.takes.offsets
     rows = [states[int(offsets[f.take]) + f.start : int(offsets[f.take]) + f.stop] for f in dataset.train]
     return torch.cat(rows).std(dim=0).clamp_min(floor)
+
+
+def target_window_of(config: Mapping[str, Any], problem: Problem) -> TargetWindow:
+    """The window of what bodies follow, ``task.ahead``.
+
+    Raises:
+        InputError: there is nothing to follow, or the setting is missing or wrong.
+    """
+    if problem.motion_seen is None:
+        raise InputError("configuration", "model.inputs", f"{WINDOW} needs states to follow and their path")
+    ahead = tuple(int(frames) for frames in config["task"].get("ahead", ()))
+    if not ahead or min(ahead) < 1:
+        raise InputError("configuration", "task.ahead", f"{WINDOW} needs frames ahead of the body, not {ahead}")
+    return TargetWindow(problem.motion_seen, ahead)

@@ -142,7 +142,7 @@ def load_forecaster(values: Mapping[str, Any], trained: Trained) -> Forecaster |
     config = read_json(folder, "config")
     follows = config.get("forecaster") is not None
     if task_of(config).protocol != "forecasts" or not (follows or config["model"]["context"]["source"] == "past"):
-        cause = "a live forecast is one of `egopose train experiment=forecasting`, or `forecasting_follow`"
+        cause = "a live forecast is one of `egopose train experiment=forecasting`, or one that follows a forecast"
         cause += "; name such a run, or null for none"
         raise InputError(folder, "task", f"this run's is {task_name(config)}: {cause}")
     humanoid = humanoid_of(config)

@@ -128,7 +128,7 @@ class LiveBody:
         self._lap = lap
         self._world, self._reached = torch.tensor([0]), torch.tensor([1])
         self._before: Seen | None = None
-        self._root = None if base.problem.path_followed is None else torch.zeros(3, dtype=torch.float64)
+        self._root = None if base.problem.motion_seen is None else torch.zeros(3, dtype=torch.float64)
         self._deadline = math.inf
         if planner is not None:
             planner.late = lambda: clock() >= self._deadline

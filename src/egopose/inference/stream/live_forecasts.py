@@ -21,7 +21,7 @@ from torchrl.modules import LSTMModule
 
 from egopose.core.errors import InputError
 from egopose.envs.env import EgoPoseEnv
-from egopose.envs.reference_forecasts import TrackForecast
+from egopose.envs.mdp.path import on_path, root_on_floor
 from egopose.envs.test_time import prepare_for_test
 from egopose.envs.transforms import StateNormalizer
 from egopose.inference.bands import quantile_bands
@@ -154,7 +154,7 @@ class LiveFutures:
         dt = base.problem.humanoid.control_dt
         self._kept = math.exp(-dt / settings.noise_time) if settings.noise_time > 0 else 0.0
         self._encoded: dict[int, Tensor] = {}
-        step = _Step(env, actor)
+        step = _Step(env, actor, self._guide)
         self._hidden_size = step.hidden_size
         self._step = self._traced(step)
 
@@ -167,7 +167,7 @@ class LiveFutures:
         example = (*self._state(), rows.expand(worlds, -1).contiguous())
         silent = torch.zeros(worlds, self._physics.model.nu)
         hidden = torch.zeros(2, 1, worlds, self._hidden_size)
-        inputs = (*example, silent, hidden, self._base.placed)
+        inputs = (*example, silent, hidden, self._base.placed, self._base.laid)
         with warnings.catch_warnings():
             # The normaliser's count, which is frozen.
             warnings.simplefilter("ignore", torch.jit.TracerWarning)
@@ -225,7 +225,7 @@ class LiveFutures:
         last, broken = physics.qpos.copy(), np.zeros(worlds, dtype=bool)
         for step in range(horizon):
             read = rows_read[step].expand(worlds, -1)
-            target, hidden = self._step(*self._state(), read, noise, hidden, self._base.placed)
+            target, hidden = self._step(*self._state(), read, noise, hidden, self._base.placed, self._base.laid)
             if worlds > 1:
                 fresh = torch.randn(noise[1:].shape, generator=generator)
                 noise[1:] = self._kept * noise[1:] + math.sqrt(1 - self._kept**2) * fresh
@@ -243,48 +243,45 @@ class _Step(nn.Module):
         InputError: the policy reads what is not known live.
     """
 
-    def __init__(self, env: TransformedEnv, actor: TensorDictModuleBase) -> None:
+    def __init__(self, env: TransformedEnv, actor: TensorDictModuleBase, guide: Guide) -> None:
         super().__init__()
-        self._problem = env.base_env.problem
+        self._problem, self._guide = env.base_env.problem, guide
         (self.normalizer,) = (part for part in env.transform if isinstance(part, StateNormalizer))
         (self.head,) = parts_of(actor, GaussianHead)
         (reader,) = (p for p in actor.modules() if isinstance(p, TensorDictModule) and p.module is self.head)
-        following = [part for part in env.transform if isinstance(part, TrackForecast)]
-        self.follow: TrackForecast | None = following[0] if following else None
-        known = ["tracking_error"] if following else []
-        if list(reader.in_keys[2:]) != known:
-            cause = f"a live forecast knows the state and the past, not {', '.join(map(str, reader.in_keys[2:]))}"
+        self._reads = [str(key) for key in reader.in_keys[1:]]
+        # What the mean is added to, if anything.
+        others = [part for part in parts_of(actor, TensorDictModule) if part.module is torch.add]
+        self._added = [str(key) for part in others for key in part.in_keys if key != "loc"]
+        if unknown := [key for key in (*self._reads, *self._added) if key not in guide.keys]:
+            cause = f"a live forecast knows the state and the past, not {', '.join(unknown)}"
             raise InputError("forecast.checkpoint", "model.inputs", cause)
         memories = parts_of(actor, LSTMModule)
         self.memory: nn.LSTM | None = memories[0].lstm if memories else None
         self.hidden_size = 0 if self.memory is None else self.memory.hidden_size
 
     def forward(
-        self, qpos: Tensor, qvel: Tensor, context: Tensor, noise: Tensor, hidden: Tensor, placed: Tensor
+        self, qpos: Tensor, qvel: Tensor, rows: Tensor, noise: Tensor, hidden: Tensor, placed: Tensor, laid: Tensor
     ) -> tuple[Tensor, Tensor]:
         """Targets ``[N, nu]`` float64 and the memory ``[2, 1, N, H]`` after it.
 
         Args:
             qpos, qvel: ``[N, nq]`` and ``[N, nv]``.
-            context: ``[N, W]`` a row of the guide.
+            rows: ``[N, W]`` of the guide.
             noise: ``[N, nu]`` in deviations.
             hidden: the memory before.
             placed: ``[N, nu]`` rad, where the bodies were put.
+            laid: ``[N, 3]`` placements of the path that is followed.
         """
         # Of operators that can be traced, where `observation` has arrays.
         state = self._problem.view({"qpos": qpos, "qvel": qvel}).humanoid_state.float()
-        inputs: tuple[Tensor, ...] = (context,)
-        targets = torch.zeros(())
-        if self.follow is not None:
-            size, joints = state.shape[-1], noise.shape[-1]
-            rest = context.shape[-1] - 2 * size - joints
-            now, following, targets, later = context.split([size, size, joints, rest], dim=-1)
-            inputs = (later, self.follow.error(state, now, following))
+        seen = self._guide.seen(rows, state, on_path(laid, root_on_floor(qpos)).float())
         read = self.normalizer.normalize(state)
         if self.memory is not None:
             out, after = self.memory(read[:, None], (hidden[0], hidden[1]))
             read, hidden = out[:, 0], torch.stack(after)
-        action, scale = self.head(read, *inputs)
-        action = action + targets
+        action, scale = self.head(read, *(seen[key] for key in self._reads))
+        for key in self._added:
+            action = action + seen[key]
         index = torch.zeros(qpos.shape[0], dtype=torch.int64)
         return self._problem.target(action + scale * noise, index, placed), hidden

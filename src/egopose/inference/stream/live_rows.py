@@ -15,7 +15,7 @@ from torchrl.envs import TransformedEnv
 
 from egopose.envs.imitation import ImitationProblem
 from egopose.envs.mdp.path import turned
-from egopose.envs.target_window import TargetWindow
+from egopose.envs.target_motion import TableMotion
 from egopose.envs.transforms import TrackingError, VisualContext
 from egopose.inference.causal import Seen
 from egopose.models.pose_regression import integrated_path
@@ -62,17 +62,15 @@ class LiveRows:
         problem = env.base_env.problem
         assert isinstance(problem, ImitationProblem)
         for part in env.transform:
-            if isinstance(part, TargetWindow):
-                assert self.path is not None
-                part.states, part.path = self.humanoid_state.numpy(), self.path.numpy()
-            elif isinstance(part, TrackingError):
+            if isinstance(part, TrackingError):
                 part.table = self.humanoid_state
             elif isinstance(part, VisualContext):
                 part.table = self.visual_context
         if problem.action.reference == "regressor":
             problem.read_actions_from(self.joint_targets)
         if self.path is not None:
-            problem.path_followed = self.path
+            assert isinstance(problem.motion_seen, TableMotion)
+            problem.motion_seen.put(self.humanoid_state, self.path)
 
 
 def _path(states: Tensor, root: Tensor, control_dt: float) -> Tensor:
