@@ -45,7 +45,7 @@ import matplotlib.pyplot as plt
 
 HERE = Path(__file__).resolve().parent
 CLIPS = Path(str(files("egopose") / "assets" / "clips"))
-PRETRAINED = "pretrained:cmu6_estimation"
+PRETRAINED = "pretrained:people_estimation"
 SHOWN = (12, 16, 20, 24)  # frames of the clip, 1/30 s each: steps of the walk
 
 

@@ -35,7 +35,7 @@ from egopose.pipeline.run import build_run
 from egopose.vision.video import write_video
 
 ROOT = Path(__file__).resolve().parents[2]
-NAME = "cmu6_estimation"
+NAME = "people_estimation"
 LARGEST = 32e6  # bytes of all that ships: weights 18, BlazePose 9.4, clips 2.7, textures 0.2
 
 
@@ -115,7 +115,7 @@ def test_damage_is_refused_by_the_files_name(which: str, tmp_path: Path, monkeyp
 
 
 @pytest.mark.parametrize(
-    ("name", "said"), [("cmu6_estimaton", "did you mean pretrained:cmu6"), ("x", f"there are .*{NAME}")]
+    ("name", "said"), [("people_estimaton", "did you mean pretrained:people"), ("x", f"there are .*{NAME}")]
 )
 def test_a_wrong_name_is_told_the_right_ones(name: str, said: str) -> None:
     with pytest.raises(InputError, match=said):
@@ -128,8 +128,8 @@ def test_the_former_prefix_is_still_read() -> None:
     assert weights.is_pretrained(f"pretrained:{NAME}")
     assert not weights.is_pretrained(f"runs/pretrained:{NAME}")
     assert data_at("/data", f"weights:{NAME}", "best") == data_at("/data", f"pretrained:{NAME}", "best")
-    with pytest.raises(InputError, match=r"weights:cmu6_estimaton.*did you mean pretrained:cmu6_estimation"):
-        find_checkpoint("weights:cmu6_estimaton")
+    with pytest.raises(InputError, match=r"weights:people_estimaton.*did you mean pretrained:people_estimation"):
+        find_checkpoint("weights:people_estimaton")
 
 
 def test_a_path_that_was_overlooked_is_refused(run: Path, tmp_path: Path) -> None:
@@ -181,7 +181,7 @@ def test_results_of_shipped_weights_go_beside_the_user_and_data_may_lie_elsewher
     assert output_folder(None, find_checkpoint(name), "test") == Path("evaluation") / NAME / "test"
     data = data_at(str(tmp_path), name, "best")["data"]
     assert data["folder"] == str(tmp_path)
-    assert data["split"]["subjects"] == ["2"]
+    assert data["split"] == read_json(find_checkpoint(name), "config")["data"]["split"]
     assert not _other_store(
         read_json(find_checkpoint(name), "config"), {**read_json(find_checkpoint(name), "config"), "data": data}
     )

@@ -268,15 +268,15 @@ def test_the_help_names_both_demos(capsys: pytest.CaptureFixture[str], monkeypat
 def test_the_clip_is_a_whole_one_of_its_person() -> None:
     data = compose_config("train", ["experiment=demo"])["data"]
     assert {source.name: source.subject for source in find_sources(data)} == {
-        "cmu07_05": "cmu07",
-        "deepmimic_cartwheel": "deepmimic",
+        "cmu10_04": "cmu10",
+        "cmu35_walking_6": "cmu35",
     }
-    assert data["split"]["test_subjects"] == ["cmu07"]
+    assert data["split"]["test_subjects"] == ["cmu10"]
     assert store_folder(compose_config("train", ["experiment=demo"])) != store_folder(compose_config("train"))
 
 
 def test_the_weights_in_the_package_can_be_shown() -> None:
-    assert {"cmu6_estimation", "cmu6_forecasting"} & {name for name in pretrained_names() if demo.is_scored(name)}
+    assert {"people_estimation", "cmu6_forecasting"} & {name for name in pretrained_names() if demo.is_scored(name)}
 
 
 @pytest.mark.slow

@@ -283,7 +283,7 @@ def test_a_regressor_sees_limbs_only_where_its_kernel_names_a_finder() -> None:
     assert load_body_part_estimator_of(chosen) is finder
     assert from_mapping(KernelSettings, chosen["kernel"], "x").limb_numbers == 2 * finder.numbers
     assert not finder.training
-    for name in ("none-such", "cmu6_estimation/..", ""):
+    for name in ("none-such", "people_estimation/..", ""):
         with pytest.raises(InputError, match="no body-part estimator"):
             load_body_part_estimator(name)
 

@@ -32,7 +32,7 @@ def run(overrides: Sequence[str], rounds: int) -> dict[str, Any]:
 
     Args:
         overrides: of ``conf/estimate.yaml`` (``planner=ahead``, ``checkpoint=RUN``; without them the weights
-            ``pretrained:cmu6_estimation`` and no planner); ``film.seconds`` is the film's length.
+            ``pretrained:people_estimation`` and no planner); ``film.seconds`` is the film's length.
         rounds: how often; medians count.
 
     Returns:
@@ -50,7 +50,7 @@ def run(overrides: Sequence[str], rounds: int) -> dict[str, Any]:
         raise InputError("bench estimate", "film.seconds", str(error)) from None
     if ours or not 1 <= seconds <= 3600:
         raise InputError("bench estimate", f"film.{next(iter(ours), 'seconds')}", "give film.seconds, 1 to 3600")
-    words = ["checkpoint=pretrained:cmu6_estimation", "planner=none"]
+    words = ["checkpoint=pretrained:people_estimation", "planner=none"]
     words += [word for word in overrides if not word.startswith(_PREFIX)]
     with tempfile.TemporaryDirectory() as folder:
         film = Path(folder) / "film.mp4"

@@ -35,7 +35,7 @@ __all__ = ["run", "tables"]
 
 #: Degrees: the camera with which motions are compared, where the choice has it.
 _PITCH, _WIDTH = 20.0, 90.0
-_BODY = ("checkpoint=pretrained:cmu6_estimation", "planner=none")
+_BODY = ("checkpoint=pretrained:people_estimation", "planner=none")
 
 
 def run(overrides: Sequence[str], rounds: int) -> dict[str, Any]:

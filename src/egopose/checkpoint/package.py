@@ -102,6 +102,8 @@ def without_places(config: Mapping[str, Any], source: Path) -> dict[str, Any]:
     if data.get("takes"):
         data["takes"] = []  # a user's own files
     out = {**config, "data": data, "output": "runs", "resume": None}
+    if "training" in config:  # which run a policy came from is a place of this machine too
+        out["training"] = {**config["training"], "start_from": None}
     for key, value in _strings(out):
         if PurePath(value).is_absolute() or value.startswith("~"):
             raise InputError(source, key, f"names a place of this machine, {value!r}: it cannot be shipped")
