@@ -1,11 +1,12 @@
 """Frames in which left and right change places, found and put right.
 
 An estimator that takes a back for a front gives both legs and both arms the other side's name. Within a clip the
-names jump: the labels that move most smoothly are the right ones, found over all frames at once (Viterbi 1967). Place
-alone would also part legs that pass each other, so it is the change of velocity that counts.
+names jump: the labels that move most smoothly are the right ones, found over all frames at once (Viterbi 1967). Legs
+that pass each other change places too, so a keypoint may also go on as it moved before.
 
 A clip that has the sides wrong from end to end does not jump. There the body itself tells, where 3D is known: toes and
-nose point ahead, and a person's left lies at the left of where these point.
+nose point ahead, and a person's left lies at the left of where these point. Only a body that contradicts itself tells:
+who is taken for a back is a whole back, in depth too. Its depth is then turned round with its names.
 """
 
 from __future__ import annotations
@@ -18,14 +19,14 @@ import numpy as np
 from egopose.motion.rotations import Array
 from egopose.scene.poses.keypoints import KeypointSchema
 from egopose.scene.poses.mending import exchange_sides
-from egopose.scene.poses.track import PoseTrack
+from egopose.scene.poses.track import Mask, PoseTrack
 
 #: Limbs that get a name together, by which smoothness is judged.
 _JUDGED = ("shoulder", "elbow", "wrist", "hip", "knee", "ankle")
 #: In body heights: what a jump counts at most, what an exchange of names costs by itself, and a frame with other names
 #: than the estimator gave. The last lets the majority of the frames be right.
 _MOST, _CHANGE, _OTHER = 0.5, 0.04, 0.001
-#: What the body's own word counts, per frame.
+#: What the body's own contradiction counts, per frame.
 _BODY = 0.02
 _SURE = 0.2
 
@@ -46,9 +47,18 @@ def mend_sides(track: PoseTrack) -> PoseTrack:
     swapped[frames] = states
     if not swapped.any():
         return track
-    mended = exchange_sides(track, swapped)
+    mended = _turned_round(exchange_sides(track, swapped), swapped & (facing(track) > 0))
     note = f"left and right had changed places in {int(swapped.sum())} of {len(track)} frames; put right"
     return replace(mended, notes=(*track.notes, note))
+
+
+def _turned_round(track: PoseTrack, frames: Mask) -> PoseTrack:
+    """The track with the depth of 3D keypoints in some frames ``[T]`` mirrored about the hips."""
+    if track.positions is None or track.axes != "camera" or not frames.any():
+        return track
+    positions = track.positions.copy()
+    positions[frames, :, 2] *= -1.0
+    return replace(track, positions=positions)
 
 
 def facing(track: PoseTrack) -> Array:
@@ -101,7 +111,7 @@ def _evidence(track: PoseTrack, rows: np.ndarray) -> tuple[Array, Array]:
 
 
 def _smoothest(points: Array, sure: Array, frames: np.ndarray, words: Array) -> np.ndarray:
-    """``[N]`` which frames to exchange: the labels of least change in velocity.
+    """``[N]`` which frames to exchange: the labels of which keypoints stay, or go on as they moved, most nearly.
 
     Args:
         points: ``[N, 2, J, d]`` in body heights.
@@ -112,7 +122,7 @@ def _smoothest(points: Array, sure: Array, frames: np.ndarray, words: Array) -> 
     count = len(points)
     either = (points, points[:, ::-1])
     weights = (sure, sure[:, ::-1])
-    own = np.stack([-_BODY * words, _BODY * words + _OTHER])
+    own = np.stack([_BODY * np.maximum(-words, 0.0), np.full(count, _OTHER)])
     # A state is the labels of two frames that follow each other.
     total = {(a, b): own[a, 0] + own[b, 1] + _CHANGE * (a != b) for a, b in product((0, 1), repeat=2)}
     links: list[dict[tuple[int, int], int]] = []
@@ -123,7 +133,9 @@ def _smoothest(points: Array, sure: Array, frames: np.ndarray, words: Array) -> 
             costs = []
             for a in (0, 1):
                 ahead = either[b][n - 1] + (either[b][n - 1] - either[a][n - 2]) * (step / before)
-                away = np.minimum(np.linalg.norm(either[c][n] - ahead, axis=-1), _MOST)
+                gone_on = np.linalg.norm(either[c][n] - ahead, axis=-1)
+                stayed = np.linalg.norm(either[c][n] - either[b][n - 1], axis=-1)
+                away = np.minimum(np.minimum(gone_on, stayed), _MOST)
                 weight = np.minimum(np.minimum(weights[c][n], weights[b][n - 1]), weights[a][n - 2])
                 costs.append(total[a, b] + float((away * weight).sum() / max(weight.sum(), 1e-9)))
             link[b, c] = int(np.argmin(costs))
