@@ -19,12 +19,12 @@ from egopose.motion import rotations as rot
 from egopose.motion.motion import Motion
 from egopose.motion.skeleton import Skeleton
 from egopose.scene.lifting import (
+    BESIDE,
     JOINTS,
     KEYPOINTS,
-    SEEN_JOINTS,
-    SEEN_KEYPOINTS,
+    SEEN,
     WINDOW,
-    mirrored_joints,
+    mirrored_points,
     mirrored_windows,
     normalised_windows,
 )
@@ -162,7 +162,7 @@ def draw_windows(
         random: of every draw.
 
     Returns:
-        ``[N, 513]`` and ``[N, 21, 3]`` body heights in the axes of a camera that looks at the hips.
+        ``[N, 513]`` and ``[N, 28, 3]`` body heights in the axes of a camera that looks at the hips.
     """
     count, points = len(middles), len(KEYPOINTS)
 
@@ -207,7 +207,7 @@ def draw_windows(
     _exchange(pictures, confidence, settings.swapped, random)
     windows = normalised_windows(pictures, confidence)
     flip = uniform(count) < 0.5
-    windows[flip], target[flip] = mirrored_windows(windows[flip]), mirrored_joints(target[flip])
+    windows[flip], target[flip] = mirrored_windows(windows[flip]), mirrored_points(target[flip])
     return windows, target
 
 
@@ -246,7 +246,7 @@ def _placed(matrices: Tensor, offsets: Tensor, parents: list[int]) -> Tensor:
 
 
 def _keypoints(matrices: Tensor, positions: Tensor, beside: Tensor) -> tuple[Tensor, Tensor]:
-    """Keypoints ``[N, 9, 19, 3]`` as an estimator defines them, and the middle frame's joints ``[N, 21, 3]``."""
+    """Keypoints ``[N, 9, 19, 3]`` as an estimator defines them, and the middle frame's points ``[N, 28, 3]``."""
     joints, places = [], torch.zeros(len(KEYPOINTS), 3)
     for k, name in enumerate(KEYPOINTS):
         if name in _BESIDE:
@@ -254,12 +254,13 @@ def _keypoints(matrices: Tensor, positions: Tensor, beside: Tensor) -> tuple[Ten
             joints.append(JOINTS.index(joint))
             places[k] = torch.tensor(place)
         else:
-            joints.append(SEEN_JOINTS[SEEN_KEYPOINTS.index(k)])
+            joints.append(SEEN[k])
     # An estimator's hip stays beside the pelvis when the thigh turns.
     frames = [0 if name.endswith("hip") else joint for name, joint in zip(KEYPOINTS, joints, strict=True)]
     seen = positions[:, :, joints] + torch.einsum("ntkij,nkj->ntki", matrices[:, :, frames], places + beside)
-    target = positions[:, WINDOW // 2].clone()
-    target[:, list(SEEN_JOINTS)] = seen[:, WINDOW // 2, list(SEEN_KEYPOINTS)]
+    middle = seen[:, WINDOW // 2]
+    target = torch.cat([positions[:, WINDOW // 2], middle[:, : len(BESIDE)]], dim=1)
+    target[:, list(SEEN)] = middle
     return seen, target
 
 
