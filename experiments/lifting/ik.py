@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from egopose.humanoid.model import HumanoidModel
 from egopose.motion import rotations as rot
@@ -55,7 +56,9 @@ def first_guess(skeleton: Skeleton, points: Array) -> Array:
     x /= np.linalg.norm(x, axis=1, keepdims=True)
     qpos = np.tile(skeleton.rest_qpos(), (len(points), 1))
     qpos[:, :3] = middle[:, 0]
-    qpos[:, 3:7] = rot.continuous(rot.from_matrix(np.stack([x, np.cross(z, x), z], axis=2)))
+    qpos[:, 3:7] = rot.continuous(
+        Rotation.from_matrix(np.stack([x, np.cross(z, x), z], axis=2)).as_quat(scalar_first=True)
+    )
     return qpos
 
 
