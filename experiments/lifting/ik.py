@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -62,20 +63,22 @@ def first_guess(skeleton: Skeleton, points: Array) -> Array:
     return qpos
 
 
-def solved(humanoid: HumanoidModel, skeleton: Skeleton, points: Array, fps: float) -> dict[str, Array]:
-    """``{way: [T, nq]}`` for each of :data:`WAYS`."""
+def solved(
+    humanoid: HumanoidModel, skeleton: Skeleton, points: Array, fps: float, ways: Sequence[str] = WAYS
+) -> dict[str, Array]:
+    """``{way: [T, nq]}`` for each of ``ways``."""
     aims, start, limits = targets(skeleton, points), first_guess(skeleton, points), humanoid.joint_range
-    single = solve_in_time(skeleton, start, aims, limits)
-    single[:, 3:7] = rot.continuous(single[:, 3:7])
-    # Frames that show nothing start where their neighbours ended.
-    seen = aims.position_weight.any(axis=1)
-    bridged = single[np.flatnonzero(seen)[np.abs(np.flatnonzero(seen) - np.arange(len(seen))[:, None]).argmin(axis=1)]]
-    direct = solve_smooth(skeleton, start, aims, fps, limits=limits, stay=0.0, iterations=30)
-    return {
-        WAYS[0]: bridged,
-        WAYS[1]: direct,
-        WAYS[2]: solve_smooth(skeleton, bridged, aims, fps, limits=limits, stay=0.0),
-    }
+    out = {}
+    if WAYS[1] in ways:
+        out[WAYS[1]] = solve_smooth(skeleton, start, aims, fps, limits=limits, stay=0.0, iterations=30)
+    if WAYS[0] in ways or WAYS[2] in ways:
+        single = solve_in_time(skeleton, start, aims, limits)
+        single[:, 3:7] = rot.continuous(single[:, 3:7])
+        # Frames that show nothing start where their neighbours ended.
+        seen = np.flatnonzero(aims.position_weight.any(axis=1))
+        out[WAYS[0]] = single[seen[np.abs(seen - np.arange(len(points))[:, None]).argmin(axis=1)]]
+        out[WAYS[2]] = solve_smooth(skeleton, out[WAYS[0]], aims, fps, limits=limits, stay=0.0)
+    return {way: out[way] for way in ways}
 
 
 def acceleration(qpos: Array, fps: float) -> float:

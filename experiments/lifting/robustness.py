@@ -44,7 +44,7 @@ def robustness_figures(
         for name, case in cases.items():
             points, truth = film_points(replace(view, mended=case), network), view.truth @ view.camera.axes
             skeleton = persons_skeleton(humanoid.skeleton, points)
-            joints = points_of(skeleton, solved(humanoid, skeleton, points, track.fps)[WAYS[2]])[:, JUDGED]
+            joints = points_of(skeleton, solved(humanoid, skeleton, points, track.fps, WAYS[2:])[WAYS[2]])[:, JUDGED]
             row[name] = mpjpe(joints, truth)
             row[f"{name}, in the gap"] = mpjpe(joints[frames], truth[frames])
         row["told"] = [note for note in fill_gaps(cases["gap"]).notes if "nobody" in note]

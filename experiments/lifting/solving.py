@@ -71,7 +71,7 @@ def film_figures(
         full = np.full(points.shape, np.nan)
         full[:, JUDGED] = truth
         own = persons_skeleton(humanoid.skeleton, full)
-        steady = solved(humanoid, own, full, view.track.fps)[WAYS[2]]
+        steady = solved(humanoid, own, full, view.track.fps, WAYS[2:])[WAYS[2]]
         row["truth"] = {"error": mpjpe(points_of(own, steady)[:, JUDGED], truth)}
         row["truth"]["acceleration"] = acceleration(steady, view.track.fps)
         out[view.camera.name] = row
