@@ -251,7 +251,8 @@ def _network_points(network: LiftingNetwork, pixels: Array, confidence: Array, f
     windows = normalised_windows(torch.from_numpy(pixels)[index], torch.from_numpy(confidence)[index])
     with torch.no_grad():
         both = network(windows) + mirrored_points(network(mirrored_windows(windows)))
-    return np.asarray(0.5 * both.double().numpy())
+    points = 0.5 * both.double().numpy()
+    return np.asarray(points - points[:, [SEEN[k] for k in _HIPS]].mean(axis=1, keepdims=True))
 
 
 def _landmarks(body: PoseTrack) -> Array | None:
