@@ -27,7 +27,6 @@ from egopose.data.preparation import humanoid_of
 from egopose.motion.rotations import Array
 from egopose.pipeline.mocap_sources import clips_of
 from egopose.scene.lifting import LANDMARK_SHARE, LiftingNetwork, camera_axes, lift
-from egopose.scene.poses.mending import exchange_sides
 from egopose.scene.poses.track import PoseTrack
 
 SHARES = (0.0, 0.25, 0.5, 0.75, 1.0)
@@ -58,14 +57,10 @@ def rows_of(network: LiftingNetwork, track: PoseTrack, view: View) -> dict[str, 
 
 
 def lifting_figures(network: LiftingNetwork, man: list[View]) -> dict[str, Any]:
-    """Each view before and after sides are mended; names alone exchanged where any were."""
+    """Each view before and after sides are mended."""
     out: dict[str, Any] = {}
     for view in man:
         row = {"before": rows_of(network, view.track, view), "after": rows_of(network, view.mended, view)}
-        if view.mended.swapped.any():
-            # The same frames with their names exchanged, their depth as it was.
-            named = exchange_sides(view.track, view.mended.swapped)
-            row["names alone"] = rows_of(network, named, view)
         out[view.camera.name] = {**row, "swapped": int(view.mended.swapped.sum()), "off_px": view.off_px}
     return out
 

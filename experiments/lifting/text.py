@@ -19,8 +19,8 @@ def table(head: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
 def _lifting(result: dict[str, Any]) -> str:
     rows = []
     for view, row in result["lifting"].items():
-        stages = ("before", "names alone", "after") if row["swapped"] else ("after",)
-        for stage in (stage for stage in stages if stage in row):
+        stages = ("before", "after") if row["swapped"] else ("after",)
+        for stage in stages:
             what = f"{view}, {stage}" if row["swapped"] else view
             rows.append([what, *(f"{row[stage][c]['mpjpe']:.0f} / {row[stage][c]['pa']:.0f}" for c in _COLUMNS)])
     return table(["view", *_COLUMNS], rows)

@@ -58,8 +58,8 @@ _POINT_MIRROR = [POINTS.index(_twin(name)) for name in POINTS]
 _TRUNK = {"Spine": 0.2, "Spine1": 0.3, "Spine2": 0.6, "Spine3": 0.85, "Neck": 1.0, "Head": 1.0}
 _TRUNK |= {"RightShoulder": 1.0, "LeftShoulder": 1.0}
 
-#: Share of the 3D landmarks in the mean: across the picture and in depth. See experiments/lifting for their choice.
-LANDMARK_SHARE = (0.5, 0.5)
+#: Share of the 3D landmarks in the mean: across the picture and in depth. Chosen on BlazePose in experiments/lifting.
+LANDMARK_SHARE = (0.25, 0.75)
 #: Focal length over the picture's longer side, of a telephone's main camera: 27 mm for 36 mm of film.
 _FOCAL = 0.75
 #: Body heights per unit of a window, roughly: what the network's scale is told relative to.

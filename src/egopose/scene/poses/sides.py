@@ -6,7 +6,7 @@ that pass each other change places too, so a keypoint may also go on as it moved
 
 A clip that has the sides wrong from end to end does not jump. There the body itself tells, where 3D is known: toes and
 nose point ahead, and a person's left lies at the left of where these point. Only a body that contradicts itself tells:
-who is taken for a back is a whole back, in depth too. Its depth is then turned round with its names.
+a pose network that takes a back for a front gives a whole front.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ import numpy as np
 from egopose.motion.rotations import Array
 from egopose.scene.poses.keypoints import KeypointSchema
 from egopose.scene.poses.mending import exchange_sides
-from egopose.scene.poses.track import Mask, PoseTrack
+from egopose.scene.poses.track import PoseTrack
 
 #: Limbs that get a name together, by which smoothness is judged.
 _JUDGED = ("shoulder", "elbow", "wrist", "hip", "knee", "ankle")
@@ -47,18 +47,9 @@ def mend_sides(track: PoseTrack) -> PoseTrack:
     swapped[frames] = states
     if not swapped.any():
         return track
-    mended = _turned_round(exchange_sides(track, swapped), swapped & (facing(track) > 0))
+    mended = exchange_sides(track, swapped)
     note = f"left and right had changed places in {int(swapped.sum())} of {len(track)} frames; put right"
     return replace(mended, notes=(*track.notes, note))
-
-
-def _turned_round(track: PoseTrack, frames: Mask) -> PoseTrack:
-    """The track with the depth of 3D keypoints in some frames ``[T]`` mirrored about the hips."""
-    if track.positions is None or track.axes != "camera" or not frames.any():
-        return track
-    positions = track.positions.copy()
-    positions[frames, :, 2] *= -1.0
-    return replace(track, positions=positions)
 
 
 def facing(track: PoseTrack) -> Array:
