@@ -33,7 +33,7 @@ _MOST_CONTACTS = 20_000
 _FURTHEST = 1e4  # m
 _NAME = re.compile(r"[A-Za-z][\w-]{0,39}")
 _HEAD = """\
-# A scene: boxes, contacts and the camera. m, rad, s; z up; x is the first picture's right, y points away from the camera.
+# A scene: boxes, contacts and the camera. m, rad, s; z up; x is the picture's right, y points away.
 # What is left out (place, height, yaw, contacts) `egopose reconstruct prepare` fills in; what is given it keeps.
 """
 
