@@ -13,13 +13,14 @@ from egopose.core.config import convert
 from egopose.core.errors import InputError
 from egopose.evaluation import scene_pictures as pictures
 from egopose.evaluation.charts import Line, line_chart
-from egopose.evaluation.page import Number, Picture, Table, render
+from egopose.evaluation.page import Film, Number, Picture, Table, render
 from egopose.inference.scene_stages import Sources, clip_camera, supports_of, touching_of
 from egopose.motion.io._npz import read_arrays
 from egopose.motion.io.native import read_native
 from egopose.scene.contacts import FEET
 from egopose.scene.poses.track import load_track
 from egopose.scene.scene_file import Scene, read_scene
+from egopose.vision.video import Frame
 
 _SOURCE = "conf/reconstruct.yaml"
 
@@ -47,16 +48,16 @@ def write_scene_page(sources: Sources, folder: Path, settings: Mapping[str, Any]
         "title": f"{sources.name.name}: from the film to a scene",
         "data": {"scene": "scene.yaml"},
         "begin": scene.begin,
-        "poses": Picture(
+        "poses": _photo(
             pictures.found_poses(moments, folder, height), "As they were found. Left blue, right orange. By frame."
         ),
-        "mosaic": Picture(
+        "mosaic": _photo(
             pictures.mosaic(moments, folder), "Each picture where the first camera would see it; the hips' way."
         ),
         "camera": _camera(folder),
-        "mended": Picture(pictures.mended_poses(moments, folder, height), "Mended. Magenta: interpolated."),
+        "mended": _photo(pictures.mended_poses(moments, folder, height), "Mended. Magenta: interpolated."),
         "notes": load_track(folder / "mended.npz").notes,
-        "contacts": Picture(
+        "contacts": _photo(
             pictures.contacts_seen(moments, folder, touching, height), "Red: the foot touches something."
         ),
         "touching": _touching(folder, touching, scene),
@@ -65,7 +66,7 @@ def write_scene_page(sources: Sources, folder: Path, settings: Mapping[str, Any]
             "Keypoints grey, humanoid blue: from the camera, from its left.",
         ),
         "fit": _fit(folder),
-        "scene": Picture(
+        "scene": _photo(
             pictures.scene_seen(moments, folder, scene, height), "Humanoid, floor (squares of 1 m), boxes."
         ),
         "plan": Picture(pictures.plan(folder, scene, height), "Dots: where feet stood, right orange, left blue."),
@@ -74,6 +75,11 @@ def write_scene_page(sources: Sources, folder: Path, settings: Mapping[str, Any]
         "scene_notes": scene.notes,
     }
     (out / "page.html").write_text(render("scene.html", **values), encoding="utf-8")
+
+
+def _photo(frame: Frame, caption: str) -> Film:
+    """As WebP, a tenth of a PNG: a film of one picture."""
+    return Film([frame], 1.0, caption)
 
 
 def _camera(folder: Path) -> Any:

@@ -32,7 +32,7 @@ from egopose.scene.poses.sides import mend_sides
 from egopose.scene.poses.timing import cut, known_span, resampled
 from egopose.scene.poses.track import PoseTrack, load_track
 from egopose.scene.projection import Projection, fit_projection
-from egopose.scene.root import Support, kinematic_root
+from egopose.scene.root import SeenSteps, Support, kinematic_root
 from egopose.scene.scene_file import Scene, write_scene
 from egopose.scene.supports import filled_scene, floor_height, levels, told_contacts, touched
 from egopose.scene.upright import focal_length, orientation, view_turns
@@ -249,7 +249,8 @@ def place_root(folder: Path, source: Path, scene: Scene, humanoid: HumanoidModel
     pelvis = motion.qpos[:, :3]
     feet = _soles(humanoid, motion) - pelvis[:, None, None]
     com = reference_states(humanoid, motion)["com"].numpy() - pelvis
-    root = kinematic_root(feet, touching, com, motion.fps)
+    seen = _seen_steps(folder, motion) if camera_moves(folder, scene) != "track" else None
+    root = kinematic_root(feet, touching, com, motion.fps, seen=seen)
     floor = floor_height(root.supports, touched(scene, root.supports))
     qpos = motion.qpos.copy()
     qpos[:, :3] = root.positions - [0.0, 0.0, floor]
@@ -259,6 +260,20 @@ def place_root(folder: Path, source: Path, scene: Scene, humanoid: HumanoidModel
     rows = np.array([[s.foot, s.start, s.stop, s.height - floor] for s in root.supports])
     np.savez_compressed(out / "root.npz", supports=rows, flight=root.flight)
     save_projection(_projection(folder, body), out / "projection.npz")
+
+
+def _seen_steps(folder: Path, motion: Motion) -> SeenSteps | None:
+    """How the hips move across the line of sight, by their pixels once the camera is undone."""
+    track, camera = load_track(folder / "joints.npz"), clip_camera(folder)
+    to_world = read_arrays(folder / "orientation.npz", ("to_world",))["to_world"]
+    # Pixels a metre in the first picture: of the frame's own, and the zoom.
+    scale = np.linalg.norm(_projection(folder, motion).matrix[:, 0], axis=1) * camera.size()
+    hips = _held(track.pixels[:, BODY_25.index("mid_hip")])
+    if not np.isfinite(hips).all() or len(hips) < 2:
+        return None
+    axes = 0.5 * (to_world[1:] + to_world[:-1]).transpose(0, 2, 1)[:, :2]
+    axes /= np.linalg.norm(axes, axis=2, keepdims=True)
+    return SeenSteps(axes, np.diff(hips, axis=0) / np.sqrt(scale[1:] * scale[:-1])[:, None])
 
 
 def _soles(humanoid: HumanoidModel, motion: Motion) -> Array:

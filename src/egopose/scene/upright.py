@@ -104,8 +104,9 @@ def balance_axis(positions: Array, contacts: np.ndarray, schema: KeypointSchema)
     """``[T, 3]`` m from the middle of the feet that touch something to the centre of mass; NaN where none does."""
     ankles, toes = (positions[:, [schema.index(f"{side}_{part}") for side in FEET]] for part in ("ankle", "big_toe"))
     feet = np.where(np.isfinite(toes), 0.5 * (ankles + toes), ankles)
-    weight = contacts.astype(np.float64)[..., None]
-    carried = (np.where(weight > 0, feet, 0.0) * weight).sum(axis=1) / np.where(weight > 0, 1.0, 0.0).sum(axis=1)
+    stands = np.asarray(contacts, dtype=bool)
+    total = np.where(stands[..., None], feet, 0.0).sum(axis=1)
+    carried = total / np.where(stands.any(axis=1), stands.sum(axis=1), np.nan)[:, None]
     centre = np.zeros((len(positions), 3))
     for names, share in _MASSES.items():
         rows = positions[:, [schema.index(name) for name in names]]
