@@ -75,7 +75,7 @@ def prepare_scene(
             {**inputs["camera"], **of("poses.npz")},
             lambda advance, part: stages.follow_camera(values, sources, folder, advance, part),
         )
-        run("sides", of("poses.npz", "camera.npz"), lambda _, part: stages.mend(folder, source, part))
+        run("sides", of("poses.npz", "camera.npz"), lambda _, part: stages.mend(folder, sources, part))
         run(
             "contacts",
             {**inputs["contacts"], **of("mended.npz", "camera.npz")},

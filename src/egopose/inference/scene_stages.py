@@ -137,7 +137,7 @@ def load_camera(path: Path) -> CameraTrack:
     return CameraTrack(arrays["to_first"], arrays["degenerate"], arrays["alike"], kind)
 
 
-def mend(folder: Path, source: Path, out: Path) -> None:
+def mend(folder: Path, sources: Sources, out: Path) -> None:
     """``mended.npz``: pixels of the first frame's picture, sides put right, gaps filled; ``clip.json``: its place.
 
     Frames before the person is first seen and after the last are left out.
@@ -146,9 +146,10 @@ def mend(folder: Path, source: Path, out: Path) -> None:
     mended = fill_gaps(mend_sides(camera.undo_track(track)))
     start, stop = known_span(mended)
     if stop - start < _LEAST_FRAMES:
-        raise InputError(source, "person", f"was seen in {stop - start} frames; {_LEAST_FRAMES} are needed")
+        raise InputError(sources.name, "person", f"was seen in {stop - start} frames; {_LEAST_FRAMES} are needed")
     cut(mended, start, stop).save(out / "mended.npz")
-    (out / "clip.json").write_text(json.dumps({"start": start, "stop": stop, "of": len(track)}))
+    video = None if sources.video is None else str(sources.video.resolve())
+    (out / "clip.json").write_text(json.dumps({"start": start, "stop": stop, "of": len(track), "video": video}))
 
 
 def clip_of(folder: Path) -> tuple[int, int]:
