@@ -32,7 +32,7 @@ from egopose.scene.poses.sides import mend_sides
 from egopose.scene.poses.timing import cut, known_span, resampled
 from egopose.scene.poses.track import PoseTrack, load_track
 from egopose.scene.projection import Projection, fit_projection
-from egopose.scene.root import SeenSteps, Support, kinematic_root
+from egopose.scene.root import RootSettings, SeenSteps, Support, kinematic_root
 from egopose.scene.scene_file import Scene, write_scene
 from egopose.scene.supports import filled_scene, floor_height, levels, told_contacts, touched
 from egopose.scene.upright import focal_length, orientation, view_turns
@@ -42,6 +42,8 @@ _SOURCE = "conf/reconstruct.yaml"
 #: px and shares of the picture: a background that moves less than this stands still.
 _STILL = 0.02
 _LEAST_FRAMES = 9
+#: One camera's depths are less sure than mocap's: feet on one floor lie further apart in height.
+_ROOT = RootSettings(level=0.15, level_in_flight=0.25)
 Advance = Callable[[int], None]
 
 
@@ -245,13 +247,14 @@ def _held(values: Array) -> Array:
 def place_root(folder: Path, source: Path, scene: Scene, humanoid: HumanoidModel, out: Path) -> None:
     """``body.npz``: the motion in the world, floor at 0; ``root.npz``: supports; ``projection.npz``: to the film."""
     motion, touching = read_native(folder / "motion.npz"), touching_of(folder, scene)
+    motion = replace(motion, qpos=motion.qpos.copy())
     if not touching.any():
         raise InputError(source, "contacts", "no foot touches anything: say which frames do in the scene file")
     pelvis = motion.qpos[:, :3]
     feet = _soles(humanoid, motion) - pelvis[:, None, None]
     com = reference_states(humanoid, motion)["com"].numpy() - pelvis
     seen = _seen_steps(folder, motion) if camera_moves(folder, scene) != "track" else None
-    root = kinematic_root(feet, touching, com, motion.fps, seen=seen)
+    root = kinematic_root(feet, touching, com, motion.fps, _ROOT, seen)
     floor = floor_height(root.supports, touched(scene, root.supports))
     qpos = motion.qpos.copy()
     qpos[:, :3] = root.positions - [0.0, 0.0, floor]

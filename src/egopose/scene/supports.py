@@ -14,10 +14,10 @@ from egopose.scene.contacts import FEET
 from egopose.scene.root import Support
 from egopose.scene.scene_file import FLOOR, Box, Contact, Scene
 
-#: m: a support this much above the floor is on something.
-_STEP = 0.12
-#: m: supports on one box lie no further from the last of them, and no further from each other in height.
-_REACH, _ALIKE = 1.2, 0.12
+#: m: a support this much above the floor is on something. One camera's depths put feet on one floor 0.1 m apart.
+_STEP = 0.15
+#: m: supports on one box lie no further from the nearest of them, and no further from each other in height.
+_REACH, _ALIKE = 1.2, 0.25
 #: m around the feet that stood on a box that nobody described, and its least side.
 _MARGIN, _LEAST_SIDE = 0.2, 0.5
 
@@ -114,11 +114,10 @@ def levels(
 def _same(
     k: int, group: Sequence[int], supports: Sequence[Support], touches: Sequence[str | None], feet: Array
 ) -> bool:
-    last = group[-1]
-    if touches[k] is not None or touches[last] is not None:
-        return touches[k] == touches[last]
-    near = np.linalg.norm(_place(supports[k], feet) - _place(supports[last], feet)) < _REACH
-    return bool(near and abs(supports[k].height - supports[last].height) < _ALIKE)
+    if touches[k] is not None or touches[group[0]] is not None:
+        return touches[k] == touches[group[0]]
+    near = min(float(np.linalg.norm(_place(supports[k], feet) - _place(supports[one], feet))) for one in group)
+    return near < _REACH and abs(supports[k].height - float(np.mean([supports[one].height for one in group]))) < _ALIKE
 
 
 def _place(support: Support, feet: Array) -> Array:
