@@ -15,6 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
+from scipy.ndimage import binary_dilation
 
 from egopose.motion.rotations import Array
 
@@ -31,6 +32,7 @@ class RootSettings:
         guessed: firmness of a foot that must stand though no contact is known, 0 to 1.
         flight: m/s^2, of what the centre of mass's acceleration in flight differs from gravity by.
         sway: m/s^2, of the centre of mass's acceleration on the feet; it only fills what feet leave open.
+        landing: m/s^2, of that just before and after a flight: people land with ten times their weight.
         level: m: supports whose heights differ by less are one level, where one foot stands while the other lands.
         level_in_flight: m: likewise after a flight, whose height is known less well.
         lowness: m: of a foot's points, those that much higher than the lowest hardly count.
@@ -44,6 +46,7 @@ class RootSettings:
     guessed: float = 0.05
     flight: float = 0.5
     sway: float = 5.0
+    landing: float = 100.0
     level: float = 0.08
     level_in_flight: float = 0.15
     lowness: float = 0.02
@@ -235,7 +238,8 @@ def _bending(
         return sparse.csr_array((0, frames)), np.zeros((0, 3))
     ones = np.ones(frames - 2)
     second = sparse.diags_array([ones, -2 * ones, ones], offsets=[0, 1, 2], shape=(frames - 2, frames)).tocsr()
-    scale = np.where(flight[1:-1], settings.flight, settings.sway)
+    beside = binary_dilation(flight, iterations=max(1, round(settings.settling * fps)))
+    scale = np.where(flight, settings.flight, np.where(beside, settings.landing, settings.sway))[1:-1]
     fall = np.outer(flight[1:-1], [0.0, 0.0, -GRAVITY])
     target = (fall - np.diff(center_of_mass, n=2, axis=0) * fps**2) / scale[:, None]
     return sparse.diags_array(fps**2 / scale).tocsr() @ second, target
