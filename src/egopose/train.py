@@ -2,8 +2,8 @@
 
 With ``--config-name body_parts`` it trains what finds the wearer's body parts in a picture (docs/howto-body-parts.md),
 with ``--config-name head_signal`` what reads states from a camera's motion (docs/howto-estimate.md), with
-``--config-name contacts`` what tells which foot touches something, and with ``--config-name tracker`` a policy that
-follows any motion, before PPO goes on with it.
+``--config-name contacts`` what tells which foot touches something, with ``--config-name lifter`` what lifts 2D
+keypoints (docs/howto-lift.md), and with ``--config-name tracker`` a policy that follows any motion, before PPO goes on.
 """
 
 from __future__ import annotations
@@ -30,6 +30,7 @@ def hydra_main(config: DictConfig) -> float:
     from egopose.pipeline.body_parts import train_body_parts
     from egopose.pipeline.contacts import train_contacts
     from egopose.pipeline.head_signal import train_head_signal
+    from egopose.pipeline.lifting import train_lifter
     from egopose.pipeline.tracker import train_tracker
     from egopose.pipeline.training import STOPPING, start_run
 
@@ -38,7 +39,7 @@ def hydra_main(config: DictConfig) -> float:
     logging.getLogger("absl").setLevel(logging.ERROR)
     try:
         others = {"body_parts": train_body_parts, "head_signal": train_head_signal}
-        others |= {"contacts": train_contacts, "tracker": train_tracker}
+        others |= {"contacts": train_contacts, "lifter": train_lifter, "tracker": train_tracker}
         if state.job.config_name in others:
             others[state.job.config_name](resolved(config))
             return 0.0

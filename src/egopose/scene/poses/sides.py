@@ -1,11 +1,12 @@
 """Frames in which left and right change places, found and put right.
 
 An estimator that takes a back for a front gives both legs and both arms the other side's name. Within a clip the
-names jump: the labels that move most smoothly are the right ones, found over all frames at once (Viterbi 1967). Place
-alone would also part legs that pass each other, so it is the change of velocity that counts.
+names jump: the labels that move most smoothly are the right ones, found over all frames at once (Viterbi 1967). Legs
+that pass each other change places too, so a keypoint may also go on as it moved before.
 
 A clip that has the sides wrong from end to end does not jump. There the body itself tells, where 3D is known: toes and
-nose point ahead, and a person's left lies at the left of where these point.
+nose point ahead, and a person's left lies at the left of where these point. Only a body that contradicts itself tells:
+a pose network that takes a back for a front gives a whole front.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ _JUDGED = ("shoulder", "elbow", "wrist", "hip", "knee", "ankle")
 #: In body heights: what a jump counts at most, what an exchange of names costs by itself, and a frame with other names
 #: than the estimator gave. The last lets the majority of the frames be right.
 _MOST, _CHANGE, _OTHER = 0.5, 0.04, 0.001
-#: What the body's own word counts, per frame.
+#: What the body's own contradiction counts, per frame.
 _BODY = 0.02
 _SURE = 0.2
 
@@ -101,7 +102,7 @@ def _evidence(track: PoseTrack, rows: np.ndarray) -> tuple[Array, Array]:
 
 
 def _smoothest(points: Array, sure: Array, frames: np.ndarray, words: Array) -> np.ndarray:
-    """``[N]`` which frames to exchange: the labels of least change in velocity.
+    """``[N]`` which frames to exchange: the labels of which keypoints stay, or go on as they moved, most nearly.
 
     Args:
         points: ``[N, 2, J, d]`` in body heights.
@@ -112,7 +113,7 @@ def _smoothest(points: Array, sure: Array, frames: np.ndarray, words: Array) -> 
     count = len(points)
     either = (points, points[:, ::-1])
     weights = (sure, sure[:, ::-1])
-    own = np.stack([-_BODY * words, _BODY * words + _OTHER])
+    own = np.stack([_BODY * np.maximum(-words, 0.0), np.full(count, _OTHER)])
     # A state is the labels of two frames that follow each other.
     total = {(a, b): own[a, 0] + own[b, 1] + _CHANGE * (a != b) for a, b in product((0, 1), repeat=2)}
     links: list[dict[tuple[int, int], int]] = []
@@ -123,7 +124,9 @@ def _smoothest(points: Array, sure: Array, frames: np.ndarray, words: Array) -> 
             costs = []
             for a in (0, 1):
                 ahead = either[b][n - 1] + (either[b][n - 1] - either[a][n - 2]) * (step / before)
-                away = np.minimum(np.linalg.norm(either[c][n] - ahead, axis=-1), _MOST)
+                gone_on = np.linalg.norm(either[c][n] - ahead, axis=-1)
+                stayed = np.linalg.norm(either[c][n] - either[b][n - 1], axis=-1)
+                away = np.minimum(np.minimum(gone_on, stayed), _MOST)
                 weight = np.minimum(np.minimum(weights[c][n], weights[b][n - 1]), weights[a][n - 2])
                 costs.append(total[a, b] + float((away * weight).sum() / max(weight.sum(), 1e-9)))
             link[b, c] = int(np.argmin(costs))
