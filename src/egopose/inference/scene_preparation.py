@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from egopose.checkpoint.contacts import load_contact_network
+from egopose.checkpoint.lifting import load_lifting_network
 from egopose.checkpoint.pretrained import FOLDER
 from egopose.core.config import convert
 from egopose.core.errors import InputError
@@ -27,7 +28,7 @@ from egopose.vision.video import probe_video
 COSTS = {"poses": 250.0, "camera": 40.0, "sides": 2.0, "contacts": 1.0, "joints": 1.0, "motion": 20.0, "root": 3.0}
 COSTS |= {"scene": 1.0, "page": 30.0}
 #: Changes with what the stages compute from the same inputs.
-_VERSION = 3
+_VERSION = 4
 _SCENE = "scene.yaml"
 
 
@@ -81,7 +82,11 @@ def prepare_scene(
             {**inputs["contacts"], **of("mended.npz", "camera.npz")},
             lambda _, part: stages.tell_contacts(values, loaded, folder, part),
         )
-        run("joints", of("mended.npz"), lambda _, part: stages.lift_joints(folder, source, part))
+        run(
+            "joints",
+            {**of("mended.npz", "camera.npz"), "weights": _weights(FOLDER / "lifter")},
+            lambda _, part: stages.lift_joints(folder, load_lifting_network(), part),
+        )
         run(
             "motion",
             {**of("joints.npz", "camera.npz", "contacts.npz"), "told": told, "camera": camera},
@@ -149,12 +154,15 @@ def _inputs(values: Mapping[str, Any], sources: Sources, network: Path) -> dict[
         files = sorted(sources.poses.glob("*.json")) if sources.poses.is_dir() else [sources.poses]
         found = [[file.name, sha256_of(file)] for file in files]
     told = {"video": film, "found": found, "fps": sources.fps}
-    weights = [[str(p.relative_to(network)), sha256_of(p)] for p in sorted(network.rglob("*")) if p.is_file()]
     return {
         "poses": {**told, "at": values["at"], "read": values["read"], "turns": values["estimator"]["turns"]},
         "camera": {"video": film, **values["camera"]},
-        "contacts": {**{k: v for k, v in values["contacts"].items() if k != "network"}, "weights": weights},
+        "contacts": {**{k: v for k, v in values["contacts"].items() if k != "network"}, "weights": _weights(network)},
     }
+
+
+def _weights(folder: Path) -> list[list[str]]:
+    return [[str(p.relative_to(folder)), sha256_of(p)] for p in sorted(folder.rglob("*")) if p.is_file()]
 
 
 def _of_contacts(scene: Scene) -> list[str]:

@@ -24,6 +24,7 @@ from egopose.motion.rotations import Array
 from egopose.scene.articulation import articulated
 from egopose.scene.camera import CameraTrack, camera_motion
 from egopose.scene.contacts import FEET, LOWER_BODY, ContactNetwork, estimate_contacts
+from egopose.scene.lifting import LiftingNetwork, lifted_track
 from egopose.scene.poses.blazepose import BlazePose
 from egopose.scene.poses.keypoints import BODY_25, HUMANOID_JOINTS
 from egopose.scene.poses.mending import fill_gaps
@@ -197,19 +198,12 @@ def touching_of(folder: Path, scene: Scene) -> NDArray[np.bool_]:
     return found if told is None else told
 
 
-def lift_joints(folder: Path, source: Path, out: Path) -> None:
-    """``joints.npz``: 3D keypoints ``BODY_25`` in each frame's own camera axes."""
+def lift_joints(folder: Path, network: LiftingNetwork, out: Path) -> None:
+    """``joints.npz``: 3D keypoints ``BODY_25`` in axes that look straight at the hips; NaN where little was seen."""
     track = load_track(folder / "mended.npz")
-    positions = lift(track, source)
-    replace(track.to_schema(BODY_25), positions=positions).save(out / "joints.npz")
-
-
-def lift(track: PoseTrack, source: Path) -> Array:
-    """``[T, 25, 3]`` m, camera axes, relative to the middle of the hips; NaN where unknown."""
-    positions = track.to_schema(BODY_25).positions
-    if positions is None:
-        raise InputError(source, "poses", "have no 3D keypoints, and nothing here makes them of 2D ones yet")
-    return positions
+    seen = replace(track, pixels=clip_camera(folder).redo(track.pixels))
+    lifted = lifted_track(seen, network)
+    replace(lifted, pixels=track.to_schema(BODY_25).pixels).save(out / "joints.npz")
 
 
 def pose_body(folder: Path, source: Path, scene: Scene, humanoid: HumanoidModel, out: Path) -> None:
