@@ -119,9 +119,9 @@ class SceneViewer:
         asked(self._row, self._show_row)
         asked(self._frame, lambda: self._seek(int(self._frame.value)))
         self._play.on_click(lambda _: self._asked.put(lambda: self._player.play(not self._player.playing)))
-        actions = {self._add: self.add_box, self._remove: self.remove_box, self._save: self.save}
-        actions |= {self._set: self.set_contact, self._drop: self.remove_contact}
-        for button, action in actions.items():
+        actions = [(self._add, self.add_box), (self._remove, self.remove_box), (self._save, self.save)]
+        actions += [(self._set, self.set_contact), (self._drop, self.remove_contact)]
+        for button, action in actions:
             button.on_click(partial(self._ask, action))
 
     def _ask(self, action: Callable[[], None], _: Any) -> None:
