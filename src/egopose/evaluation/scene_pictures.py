@@ -16,7 +16,7 @@ from egopose.motion.io.native import read_native
 from egopose.motion.rotations import Array
 from egopose.scene.camera import CameraTrack
 from egopose.scene.contacts import FEET
-from egopose.scene.drawing import box_corners, draw_bones, draw_box, draw_floor
+from egopose.scene.drawing import body_points, box_corners, draw_bones, draw_box, draw_floor
 from egopose.scene.poses.drawing import draw_pose
 from egopose.scene.poses.keypoints import BODY_25
 from egopose.scene.poses.track import PoseTrack, load_track
@@ -42,7 +42,7 @@ class Moments:
         """All of them beside each other in rows of four; ``draw`` gets a picture and its frame number."""
         panels = []
         for number, frame in zip(self.numbers, self.frames, strict=True):
-            panels.append(_labelled(_scaled(draw(frame, number), height), str(number + start)))
+            panels.append(label_frame(_scaled(draw(frame, number), height), str(number + start)))
         return rows_of(panels)
 
 
@@ -136,8 +136,7 @@ def bodies(moments: Moments, folder: Path, height: int) -> Frame:
     """Each moment from the first camera's side and, below, from the right: keypoints grey, the humanoid blue."""
     points = read_arrays(folder / "orientation.npz", ("positions",))["positions"]
     motion = read_native(folder / "motion.npz")
-    joints, _ = motion.forward_kinematics()
-    parents = np.array(motion.skeleton.parents)
+    joints, parents = body_points(motion)
     panels = []
     for axes, name in (((0, 2), "front"), ((1, 2), "side")):
         for t in moments.numbers:
@@ -147,15 +146,15 @@ def bodies(moments: Moments, folder: Path, height: int) -> Frame:
                 if np.isfinite(places[0][[a, b]]).all():
                     ends = [(int(x), int(y)) for x, y in places[0][[a, b]].round()]
                     cv2.line(panel, ends[0], ends[1], _KEYPOINTS, 2, cv2.LINE_AA)
-            panels.append(_labelled(draw_bones(panel, places[1], parents, _MODEL), f"{t} {name}"))
+            panels.append(label_frame(draw_bones(panel, places[1], parents, _MODEL), f"{t} {name}"))
     return rows_of(panels, len(moments.numbers))
 
 
 def scene_seen(moments: Moments, folder: Path, scene: Scene, height: int) -> Frame:
     """The humanoid, the floor's metres and the boxes in the film."""
     body, projection = read_native(folder / "body.npz"), load_projection(folder / "projection.npz")
-    joints, _ = body.forward_kinematics()
-    places, parents = projection.pixels(joints), np.array(body.skeleton.parents)
+    joints, parents = body_points(body)
+    places = projection.pixels(joints)
 
     def draw(frame: Frame, t: int) -> Frame:
         out = draw_floor(frame, body.qpos[t, :2], projection, t)
@@ -176,7 +175,7 @@ def plan(folder: Path, scene: Scene, height: int) -> Frame:
     boxes = [box_corners(box) for box in scene.boxes if box.known]
     every = np.concatenate([joints[:, 0], feet.reshape(-1, 3), *boxes])
     panels = []
-    for axes, name in (((0, 1), "from above: x right, y away from the camera"), ((0, 2), "from the camera: x, height")):
+    for axes, name in (((0, 1), "from above: y away from the camera"), ((0, 2), "from the camera: height")):
         low, high = every[:, axes].min(axis=0) - 0.5, every[:, axes].max(axis=0) + 0.5
         scale = min(2 * height / (high - low)[1], 3 * height / (high - low)[0])
         size = (int(scale * (high - low)[0]), int(scale * (high - low)[1]))
@@ -188,10 +187,10 @@ def plan(folder: Path, scene: Scene, height: int) -> Frame:
             flat = (points[..., a] - low) * scale
             return np.stack([flat[..., 0], top - flat[..., 1]], axis=-1).round().astype(np.int32)
 
-        for axis, line in ((0, "x"), (1, "y")):
+        for axis in (0, 1):
             for metre in range(int(np.ceil(low[axis])), int(np.floor(high[axis])) + 1):
                 at = round((metre - low[axis]) * scale)
-                ends = ((at, 0), (at, size[1])) if line == "x" else ((0, size[1] - at), (size[0], size[1] - at))
+                ends = ((0, size[1] - at), (size[0], size[1] - at)) if axis else ((at, 0), (at, size[1]))
                 cv2.line(panel, ends[0], ends[1], (215, 215, 215), 1 if metre else 2)
         for corners in boxes:
             cv2.polylines(panel, [cv2.convexHull(to_panel(corners))], True, (200, 130, 0), 2, cv2.LINE_AA)
@@ -199,19 +198,15 @@ def plan(folder: Path, scene: Scene, height: int) -> Frame:
         for foot, colour in enumerate(((230, 120, 40), (40, 150, 230))):
             for place in to_panel(feet[body.contacts[:, foot], foot]):
                 cv2.circle(panel, (int(place[0]), int(place[1])), 3, colour, -1, cv2.LINE_AA)
-        panels.append(_labelled(panel, name))
-    width = max(panel.shape[1] for panel in panels)
-    wide = [np.pad(p, ((0, 8), (0, width - p.shape[1]), (0, 0)), constant_values=_PAPER) for p in panels]
-    return np.concatenate(wide)
+        panels.append((panel, name))
+    width = max(2 * height, *(panel.shape[1] for panel, _ in panels))
+    wide = [(np.pad(p, ((0, 8), (0, width - p.shape[1]), (0, 0)), constant_values=_PAPER), name) for p, name in panels]
+    return np.concatenate([label_frame(panel, name) for panel, name in wide])
 
 
 def _scaled(frame: Frame, height: int) -> Frame:
     scale = height / frame.shape[0]
     return np.asarray(cv2.resize(frame, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), dtype=np.uint8)
-
-
-def _labelled(frame: Frame, label: str) -> Frame:
-    return label_frame(frame, label)
 
 
 def _extent(track: PoseTrack) -> tuple[int, int]:

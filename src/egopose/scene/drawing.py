@@ -5,6 +5,8 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
+from egopose.motion.kinematics import tip_positions
+from egopose.motion.motion import Motion
 from egopose.motion.rotations import Array
 from egopose.scene.projection import Projection
 from egopose.scene.scene_file import Box
@@ -29,8 +31,16 @@ def box_corners(box: Box) -> Array:
     return np.concatenate([np.column_stack([flat, np.full(4, height)]) for height in (box.height, 0.0)])
 
 
+def body_points(motion: Motion) -> tuple[Array, np.ndarray]:
+    """``[T, J + K, 3]`` m, joints and tips of a body, and the row that each hangs on; -1 for the root."""
+    positions, quats = motion.forward_kinematics()
+    names, tips = tip_positions(motion.skeleton, positions, quats)
+    parents = [*motion.skeleton.parents, *(motion.skeleton.index(name) for name in names)]
+    return np.concatenate([positions, tips], axis=1), np.array(parents)
+
+
 def draw_bones(frame: Frame, places: Array, parents: np.ndarray, colour: tuple[int, int, int] = _BODY) -> Frame:
-    """A copy of the picture with a line from every joint ``[J, 2]`` (px) to its parent; -1 has none."""
+    """A copy of the picture with a line from every point ``[J, 2]`` (px) to the one it hangs on, see above."""
     out = frame.copy()
     width = max(1, round(max(frame.shape[:2]) / 400))
     for joint, parent in enumerate(parents):

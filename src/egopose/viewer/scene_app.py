@@ -15,7 +15,7 @@ import numpy as np
 from egopose.core.errors import InputError
 from egopose.inference.scene_stages import load_projection
 from egopose.motion.io.native import read_native
-from egopose.scene.drawing import draw_bones, draw_box
+from egopose.scene.drawing import body_points, draw_bones, draw_box
 from egopose.scene.edits import add_box, remove_box, remove_contact, with_box, with_contact
 from egopose.scene.projection import Projection
 from egopose.scene.scene_file import EFFECTORS, FLOOR, Box, Contact, read_scene, write_scene
@@ -59,8 +59,8 @@ class SceneViewer:
         if film is not None:
             self._width = probe_video(film).width
             self._pictures = Pictures(Footage(film, start=self.scene.begin), self._body.fps, len(self._body))
-        joints, _ = self._body.forward_kinematics()
-        self._places = self._projection.pixels(joints)
+        points, self._parents = body_points(self._body)
+        self._places = self._projection.pixels(points)
         self._server, self._door, self.url = open_server(address)
         self._player = Player()
         self._player.load(len(self._body), self._body.fps)
@@ -260,7 +260,7 @@ class SceneViewer:
             for box in self.scene.boxes:
                 if box.known:
                     picture = draw_box(picture, box, small, frame)
-            self._video.image = draw_bones(picture, self._places[frame] * scale, np.array(self._body.skeleton.parents))
+            self._video.image = draw_bones(picture, self._places[frame] * scale, self._parents)
 
 
 def is_scene_folder(path: Path) -> bool:
