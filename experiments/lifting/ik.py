@@ -48,7 +48,8 @@ def first_guess(skeleton: Skeleton, points: Array) -> Array:
     held = points.copy()
     for column in held.reshape(len(held), -1).T:
         known = np.isfinite(column)
-        column[~known] = np.interp(np.flatnonzero(~known), np.flatnonzero(known), column[known])
+        if known.any():
+            column[~known] = np.interp(np.flatnonzero(~known), np.flatnonzero(known), column[known])
     left, right = (held[:, [JOINTS.index(side + part) for part in ("UpLeg", "Arm")]] for side in ("Left", "Right"))
     middle = 0.5 * (left + right)
     up, across = middle[:, 1] - middle[:, 0], (left - right).mean(axis=1)

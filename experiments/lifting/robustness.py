@@ -44,7 +44,7 @@ def robustness_figures(
         for name, case in cases.items():
             points, truth = film_points(replace(view, mended=case), network), view.truth @ view.camera.axes
             skeleton = persons_skeleton(humanoid.skeleton, points)
-            joints = points_of(skeleton, solved(humanoid, skeleton, points, track.fps, WAYS[2:])[WAYS[2]])[:, JUDGED]
+            joints = points_of(skeleton, solved(humanoid, skeleton, points, track.fps, WAYS[1:2])[WAYS[1]])[:, JUDGED]
             row[name] = mpjpe(joints, truth)
             row[f"{name}, in the gap"] = mpjpe(joints[frames], truth[frames])
         row["told"] = [note for note in fill_gaps(cases["gap"]).notes if "nobody" in note]
@@ -57,10 +57,10 @@ def robustness_figures(
 
 def wrong_person(view: View, other: View) -> dict[str, object]:
     """Frames in which a woman is followed while the man is not found for 20 frames; he is chosen in the first frame."""
-    lost = range(40, 60)
+    lost, found = range(40, 60), view.track.confidence.any(axis=1)
     frames = [
         [Candidate(other.track.pixels[t], other.track.confidence[t])]
-        + ([] if t in lost else [Candidate(view.track.pixels[t], view.track.confidence[t])])
+        + ([Candidate(view.track.pixels[t], view.track.confidence[t])] if t not in lost and found[t] else [])
         for t in range(len(view.track))
     ]
     at = np.nanmean(view.track.pixels[0], axis=0)

@@ -14,6 +14,7 @@ from dataclasses import replace
 
 import numpy as np
 import torch
+from scipy.ndimage import binary_closing
 from torch import Tensor, nn
 
 from egopose.core.errors import InputError
@@ -67,7 +68,8 @@ _SPREAD = 0.33
 _HEIGHT = 1.7  # m, where nothing tells
 _SURE = 0.1  # below this confidence a keypoint is unseen
 _LEAST = 6  # keypoints that a frame must show
-_BRIDGED = 0.3  # s: a window's length
+_BRIDGED = 0.3  # s, a window's length: gaps shorter than that are interpolated
+_GUESSED = 0.5  # confidence of what was interpolated
 
 
 class LiftingNetwork(nn.Module):
@@ -175,7 +177,7 @@ def lift(
     points *= height or _HEIGHT
     if landmarks is not None:
         points = _mean(points, landmarks, landmark_share)
-    points[~_shown(confidence, track.fps)] = np.nan
+    points[~_bridged((confidence > 0).sum(axis=1) >= _LEAST, track.fps)] = np.nan
     return points
 
 
@@ -227,7 +229,15 @@ def _inputs(body: PoseTrack) -> tuple[Array, Array]:
     pixels = body.pixels[:, rows]
     seen = np.isfinite(pixels).all(axis=-1) & ~body.filled[:, rows] & (body.confidence[:, rows] >= _SURE)
     pixels[:, list(_HIPS)] = _held_hips(body)
-    return np.nan_to_num(pixels), np.where(seen, body.confidence[:, rows], 0.0)
+    guessed = np.where(_bridged(seen, body.fps), _GUESSED, 0.0)
+    return np.nan_to_num(pixels), np.where(seen, body.confidence[:, rows], guessed)
+
+
+def _bridged(seen: np.ndarray, fps: float) -> np.ndarray:
+    """``seen [T, ...]`` with its gaps in time that are shorter than a window filled."""
+    length = max(1, round(_BRIDGED * fps))
+    structure = np.ones((length, *(1,) * (seen.ndim - 1)), dtype=bool)
+    return np.asarray(binary_closing(seen, structure) | seen)
 
 
 def _held_hips(body: PoseTrack) -> Array:
@@ -279,16 +289,3 @@ def _mean(points: Array, landmarks: Array, share: tuple[float, float]) -> Array:
     for name, part in _TRUNK.items():
         out[:, JOINTS.index(name)] += part * shoulders
     return out
-
-
-def _shown(confidence: Array, fps: float) -> np.ndarray:
-    """``[T]`` frames that show enough, or lie between two of them no more than a window apart."""
-    enough = (confidence > 0).sum(axis=1) >= _LEAST
-    at = np.flatnonzero(enough)
-    if not len(at):
-        return enough
-    frames = np.arange(len(enough))
-    before, after = np.searchsorted(at, frames, side="right") - 1, np.searchsorted(at, frames)
-    inside = (before >= 0) & (after < len(at))
-    gap = np.where(inside, at[np.minimum(after, len(at) - 1)] - at[np.maximum(before, 0)], len(enough))
-    return np.asarray(enough | (inside & (gap <= _BRIDGED * fps)))
