@@ -55,11 +55,12 @@ def prepare_scene(
     loaded = load_contact_network(network)
     humanoid = humanoid_of(values)
     inputs = _inputs(values, sources, network)
+    body = {"humanoid": values["humanoid"], "sim": values["sim"]}
     frames = _frames(sources)
     with StageProgress(COSTS, frames) as progress:
 
         def run(name: str, more: Mapping[str, Any], write: Callable[[Advance, Path], None]) -> None:
-            everything = {**more, "version": _VERSION, "humanoid": values["humanoid"], "sim": values["sim"]}
+            everything = {**more, "version": _VERSION}
             if store.done(name, everything):
                 return
             with progress.stage(name) as advance:
@@ -89,12 +90,12 @@ def prepare_scene(
         )
         run(
             "motion",
-            {**of("joints.npz", "camera.npz", "contacts.npz"), "told": told, "camera": camera},
+            {**of("joints.npz", "camera.npz", "contacts.npz"), "told": told, "camera": camera, **body},
             lambda _, part: stages.pose_body(folder, source, scene, humanoid, part),
         )
         run(
             "root",
-            {**of("motion.npz", "contacts.npz", "joints.npz", "camera.npz"), "told": told, "camera": camera},
+            {**of("motion.npz", "contacts.npz", "joints.npz", "camera.npz"), "told": told, "camera": camera, **body},
             lambda _, part: stages.place_root(folder, source, scene, humanoid, part),
         )
         if not edited:
