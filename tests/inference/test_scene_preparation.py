@@ -18,6 +18,7 @@ from helpers.walking import walking
 
 from egopose.core.config import compose_config
 from egopose.core.errors import InputError
+from egopose.evaluation.scene_page import write_scene_page
 from egopose.inference import scene_stages
 from egopose.inference.scene_preparation import prepare_scene
 from egopose.inference.scene_stages import Sources
@@ -79,6 +80,16 @@ def test_the_walk_comes_back(prepared: Path) -> None:
     there = np.linalg.norm(body.qpos[len(walking()) - 1, :2])
     path = np.linalg.norm(walking().qpos[-1, :2] - walking().qpos[0, :2])
     assert there == pytest.approx(path, rel=0.3)
+
+
+def test_the_page_shows_every_stage(prepared: Path, tmp_path: Path) -> None:
+    sources = Sources(None, prepared / "walk.npz", 30.0)
+    write_scene_page(sources, prepared / "out", {"moments": 3, "height": 60}, tmp_path)
+    page = (tmp_path / "page.html").read_text()
+    assert page.count("<section>") == 6
+    assert page.count("<figure>") == 7
+    with pytest.raises(InputError, match="page.moments"):
+        write_scene_page(sources, prepared / "out", {"moments": 0, "height": 60}, tmp_path)
 
 
 def test_a_second_call_makes_nothing(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
