@@ -88,7 +88,7 @@ def test_the_page_shows_every_stage(prepared: Path, tmp_path: Path) -> None:
     page = (tmp_path / "page.html").read_text()
     assert page.count("<section>") == 6
     assert page.count("<figure>") == 7
-    with pytest.raises(InputError, match="page.moments"):
+    with pytest.raises(InputError, match="moments"):
         write_scene_page(sources, prepared / "out", {"moments": 0, "height": 60}, tmp_path)
 
 
