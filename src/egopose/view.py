@@ -1,7 +1,8 @@
 """``python -m egopose.view RUN_OR_MOTION [ANOTHER ...]``: look at motions, estimates and forecasts in the browser.
 
 Sources: a motion file, a folder of an estimate, an evaluation's folder or a run directory; several are compared.
-Or `ws://127.0.0.1:8765/json`: what `egopose stream` sends, live.
+Or `ws://127.0.0.1:8765/json`: what `egopose stream` sends, live. Or a folder of `egopose reconstruct prepare`: its
+scene, to be changed and saved.
 Words key=value are overrides of conf/sync.yaml: how motion files are read (reader.up=y) and, for `--offset auto` and
 the viewer's button Find, the camera.
 """

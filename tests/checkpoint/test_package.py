@@ -36,7 +36,7 @@ from egopose.vision.video import write_video
 
 ROOT = Path(__file__).resolve().parents[2]
 NAME = "people_estimation"
-LARGEST = 42e6  # bytes of all that ships: policies with their regressors 17, body parts, lifting, contacts, head signals 12, BlazePose 9.4, clips 2.7
+LARGEST = 42e6  # bytes of all that ships: policies 17, networks of pictures and keypoints 12, BlazePose 9.4, clips 2.7
 
 
 def settings(run: Path, out: Path, **changed: Any) -> dict[str, Any]:

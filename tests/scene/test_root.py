@@ -11,7 +11,7 @@ from egopose.data.reference import reference_states
 from egopose.humanoid.foot_geometry import sole_positions
 from egopose.motion.contacts import contact_labels
 from egopose.motion.rotations import Array
-from egopose.scene.root import GRAVITY, kinematic_root
+from egopose.scene.root import GRAVITY, SeenSteps, kinematic_root
 
 FPS = 30.0
 
@@ -105,6 +105,28 @@ def test_a_step_whose_contact_was_missed_is_no_flight() -> None:
     root = kinematic_root(feet_of(pelvis, soles), contacts, np.zeros_like(pelvis), FPS)
     assert not root.flight.any()
     assert np.abs(root.positions - pelvis).max() < 0.02
+
+
+def test_pictures_tell_how_far_a_body_falls() -> None:
+    """A step off a roof, whose take-off and landing show no speed: only pixels tell of the fall."""
+    stand, flight = 12, 19
+    times = np.clip(np.arange(2 * stand + flight) - stand + 1, 0, flight) / FPS
+    pelvis = np.stack([times, 0 * times, 1.0 - 0.5 * GRAVITY * times**2], axis=1)
+    soles = pelvis[:, None] + [[0.0, -0.1, -1.0], [0.0, 0.1, -1.0]]
+    contacts = np.ones((len(pelvis), 2), dtype=bool)
+    contacts[stand : stand + flight - 1] = False
+    drop = 0.5 * GRAVITY * (flight / FPS) ** 2
+    axes = np.tile(np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0]]), (len(pelvis) - 1, 1, 1))
+    rng = np.random.default_rng(0)
+    steps = np.einsum("tij,tj->ti", axes, np.diff(pelvis, axis=0)) + rng.normal(scale=0.01, size=(len(pelvis) - 1, 2))
+    seen = SeenSteps(axes, steps)
+    blind = kinematic_root(feet_of(pelvis, soles), contacts, np.zeros_like(pelvis), FPS)
+    told = kinematic_root(feet_of(pelvis, soles), contacts, np.zeros_like(pelvis), FPS, seen=seen)
+    last = [support.height for support in told.supports][-1]
+    assert last == pytest.approx(-drop, abs=0.15)
+    assert [support.height for support in blind.supports][-1] > -0.5 * drop
+    with pytest.raises(ValueError, match="seen"):
+        kinematic_root(feet_of(pelvis, soles), contacts, np.zeros_like(pelvis), FPS, seen=SeenSteps(axes[1:], steps))
 
 
 @pytest.mark.parametrize("fault", ["contacts", "com", "nan", "nothing"])

@@ -13,6 +13,7 @@ VERBS = {
     "export": "write motions for other programs: BVH, GLB, AMASS npz, TRC, C3D, OpenSim, CSV",
     "view": "show motions, estimates and forecasts in the browser",
     "package": "make a small folder of a trained run to give away: no optimisers, no local paths",
+    "reconstruct": "prepare a third person's film: poses, camera, contacts, root and a scene of boxes",
     "report": "make one HTML page of an evaluation or a sweep: tables, curves, pictures",
     "stream": "estimate motion live from a camera, a video or an address: WebSocket, file, latencies",
     "bench": "measure the speed of the environment and of the pipeline",

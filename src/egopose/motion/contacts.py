@@ -30,7 +30,7 @@ def contact_labels(
     labels = low & (point_speeds(points, fps) <= speed)
     if min_frames < 1:
         raise ValueError(f"min_frames must be at least 1, got {min_frames}")
-    return ~_without_short_runs(~_without_short_runs(labels, min_frames), min_frames)
+    return ~without_short_runs(~without_short_runs(labels, min_frames), min_frames)
 
 
 def point_speeds(points: Array, fps: float) -> Array:
@@ -56,7 +56,7 @@ def _checked(points: Array) -> Array:
     return points
 
 
-def _without_short_runs(labels: NDArray[np.bool_], min_frames: int) -> NDArray[np.bool_]:
+def without_short_runs(labels: NDArray[np.bool_], min_frames: int) -> NDArray[np.bool_]:
     """Runs of True shorter than ``min_frames`` become False, save those the clip's ends may have cut."""
     out = labels.copy()
     for k in range(labels.shape[1]):

@@ -3,6 +3,9 @@
 Feet that touch something stay where they are, and carry the body. In flight the centre of mass falls as gravity has
 it. Everything is one linear least-squares problem over the clip. World: z up, m. It is the start of the reconstruction
 with physics, and its baseline.
+
+Where the camera stays in its place, the pictures also tell how the pelvis moves across the line of sight. That decides
+what happens while no foot touches anything, such as how far a body falls.
 """
 
 from __future__ import annotations
@@ -12,6 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
+from scipy.ndimage import binary_dilation
 
 from egopose.motion.rotations import Array
 
@@ -28,10 +32,13 @@ class RootSettings:
         guessed: firmness of a foot that must stand though no contact is known, 0 to 1.
         flight: m/s^2, of what the centre of mass's acceleration in flight differs from gravity by.
         sway: m/s^2, of the centre of mass's acceleration on the feet; it only fills what feet leave open.
+        landing: m/s^2, of that just before and after a flight: people land with ten times their weight.
         level: m: supports whose heights differ by less are one level, where one foot stands while the other lands.
         level_in_flight: m: likewise after a flight, whose height is known less well.
         lowness: m: of a foot's points, those that much higher than the lowest hardly count.
         ballistic: least share of a time without contact that take-off and landing speeds must tell of, to be a flight.
+        seen: m/s, of the pelvis's speed across the line of sight: a pixel at 100 pixels a metre and 30 frames/s is 0.3.
+        moving: m/s: both feet are seen to move faster through most of a flight.
     """
 
     slip: float = 0.02
@@ -39,10 +46,13 @@ class RootSettings:
     guessed: float = 0.05
     flight: float = 0.5
     sway: float = 5.0
+    landing: float = 100.0
     level: float = 0.08
     level_in_flight: float = 0.15
     lowness: float = 0.02
     ballistic: float = 0.2
+    seen: float = 0.5
+    moving: float = 0.6
 
 
 @dataclass(frozen=True)
@@ -64,8 +74,26 @@ class KinematicRoot:
     flight: NDArray[np.bool_]
 
 
+@dataclass(frozen=True)
+class SeenSteps:
+    """How pictures tell that the pelvis moves from each frame to the next.
+
+    Args:
+        axes: ``[T - 1, 2, 3]`` unit vectors in the world, across the line of sight.
+        steps: ``[T - 1, 2]`` m along them.
+    """
+
+    axes: Array
+    steps: Array
+
+
 def kinematic_root(
-    feet: Array, contacts: np.ndarray, center_of_mass: Array, fps: float, settings: RootSettings | None = None
+    feet: Array,
+    contacts: np.ndarray,
+    center_of_mass: Array,
+    fps: float,
+    settings: RootSettings | None = None,
+    seen: SeenSteps | None = None,
 ) -> KinematicRoot:
     """The pelvis's way through the world.
 
@@ -76,6 +104,7 @@ def kinematic_root(
         center_of_mass: ``[T, 3]`` m, relative to the pelvis.
         fps: frames per second.
         settings: see :class:`RootSettings`.
+        seen: of a camera that stays in its place; None where pictures tell nothing.
 
     Returns:
         See :class:`KinematicRoot`. The first support's height is 0 and the pelvis starts at x = y = 0.
@@ -99,22 +128,39 @@ def kinematic_root(
     share /= share.sum(axis=2, keepdims=True)
     between = 0.5 * (share[1:] + share[:-1])
     steps = (np.diff(feet, axis=0) * (between / between.sum(axis=2, keepdims=True))[..., None]).sum(axis=2)
-    firmness, flight = _firmness(contacts, feet, steps, center_of_mass, fps, settings)
-    positions = _least_squares(steps, firmness, flight, center_of_mass, fps, settings)
+    if seen is not None and (seen.axes.shape, seen.steps.shape) != ((len(feet) - 1, 2, 3), (len(feet) - 1, 2)):
+        raise ValueError(f"seen must be of {len(feet) - 1} steps: {list(seen.axes.shape)}, {list(seen.steps.shape)}")
+    moving = _moving(steps, seen, fps, settings)
+    firmness, flight = _firmness(contacts, feet, steps, center_of_mass, moving, fps, settings)
+    positions = _least_squares(steps, firmness, flight, center_of_mass, seen, fps, settings)
     lowest = positions[:, None, 2] + feet[..., 2].min(axis=2)
     supports = _levelled(lowest, contacts, settings)
     positions = _on_supports(positions, lowest, supports, flight, center_of_mass, fps, settings)
     return KinematicRoot(positions - [*positions[0, :2], 0.0], supports, flight)
 
 
+def _moving(steps: Array, seen: SeenSteps | None, fps: float, settings: RootSettings) -> NDArray[np.bool_]:
+    """``[T - 1]`` steps in which every foot is seen to move; ``steps [T - 1, F, 3]`` m are the feet's."""
+    if seen is None:
+        return np.zeros(len(steps), dtype=bool)
+    across = seen.steps[:, None] + np.einsum("tij,tfj->tfi", seen.axes, steps)
+    return np.asarray((np.linalg.norm(across, axis=2) * fps > settings.moving).all(axis=1))
+
+
 def _firmness(
-    contacts: np.ndarray, feet: Array, steps: Array, center_of_mass: Array, fps: float, settings: RootSettings
+    contacts: np.ndarray,
+    feet: Array,
+    steps: Array,
+    center_of_mass: Array,
+    moving: NDArray[np.bool_],
+    fps: float,
+    settings: RootSettings,
 ) -> tuple[Array, NDArray[np.bool_]]:
     """How firmly each foot stands ``[T, F]``, 0 to 1, and which frames ``[T]`` are in flight.
 
     A body that leaves with vertical speed u and lands with w has flown for (u - w) / g. Contacts are known to a few
     frames only, so the flight is that long in the middle of the time without contact. In a step without contact the
-    body sinks and then rises: u < w. There the lower foot must stand.
+    body sinks and then rises: u < w. There the lower foot must stand, unless both are seen to move.
     """
     out = np.zeros(contacts.shape)
     frames = len(contacts)
@@ -132,7 +178,9 @@ def _firmness(
         if start > 0 and stop < frames:
             left, landed = (_rise(steps, contacts, center_of_mass, frame, fps) for frame in (start - 1, stop))
             told = (left - landed) / GRAVITY * fps
-        if told >= settings.ballistic * (stop - start):
+        if np.mean(moving[max(start - 1, 0) : stop] if len(moving) else [0.0]) > 0.5:
+            flight[start:stop] = True
+        elif told >= settings.ballistic * (stop - start):
             spare = int(max(0.0, (stop - start - told) / 2))
             flight[start + spare : stop - spare] = True
         else:
@@ -154,6 +202,7 @@ def _least_squares(
     firmness: Array,
     flight: NDArray[np.bool_],
     center_of_mass: Array,
+    seen: SeenSteps | None,
     fps: float,
     settings: RootSettings,
 ) -> Array:
@@ -168,9 +217,15 @@ def _least_squares(
         rows.append(sparse.diags_array(weight).tocsr() @ change)
         values.append(-steps[:, foot] * weight[:, None])
     bend, target = _bending(flight, center_of_mass, fps, settings)
-    matrix = sparse.vstack([*rows, bend]).tocsc()
-    normal = (matrix.T @ matrix + 1e-9 * sparse.eye_array(frames)).tocsc()
-    out: Array = sparse.linalg.spsolve(normal, matrix.T @ np.concatenate([*values, target])).reshape(frames, 3)
+    # The three coordinates of each frame follow each other.
+    matrix = sparse.kron(sparse.vstack([*rows, bend]), sparse.eye_array(3), format="csr")
+    right = np.concatenate([*values, target]).ravel()
+    if seen is not None:
+        along = sparse.block_diag(list(seen.axes * fps / settings.seen), format="csr")
+        matrix = sparse.vstack([matrix, along @ sparse.kron(change, sparse.eye_array(3), format="csr")])
+        right = np.concatenate([right, seen.steps.ravel() * fps / settings.seen])
+    normal = (matrix.T @ matrix + 1e-9 * sparse.eye_array(3 * frames)).tocsc()
+    out: Array = sparse.linalg.spsolve(normal, matrix.T @ right).reshape(frames, 3)
     return out
 
 
@@ -183,7 +238,8 @@ def _bending(
         return sparse.csr_array((0, frames)), np.zeros((0, 3))
     ones = np.ones(frames - 2)
     second = sparse.diags_array([ones, -2 * ones, ones], offsets=[0, 1, 2], shape=(frames - 2, frames)).tocsr()
-    scale = np.where(flight[1:-1], settings.flight, settings.sway)
+    beside = binary_dilation(flight, iterations=max(1, round(settings.settling * fps)))
+    scale = np.where(flight, settings.flight, np.where(beside, settings.landing, settings.sway))[1:-1]
     fall = np.outer(flight[1:-1], [0.0, 0.0, -GRAVITY])
     target = (fall - np.diff(center_of_mass, n=2, axis=0) * fps**2) / scale[:, None]
     return sparse.diags_array(fps**2 / scale).tocsr() @ second, target

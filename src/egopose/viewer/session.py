@@ -18,6 +18,7 @@ from egopose.viewer.auth_proxy import Address
 from egopose.viewer.clip import Footage
 from egopose.viewer.clip_sources import read_runs
 from egopose.viewer.live import LiveViewer
+from egopose.viewer.scene_app import SceneViewer, is_scene_folder
 from egopose.vision.video import probe_video
 
 _LIVE = ("ws://", "wss://")
@@ -30,7 +31,7 @@ def is_source(word: str) -> bool:
 
 def open_viewer(
     words: Sequence[str], video: Path | None, offset: float | None, address: str, port: int, token: str | None
-) -> Viewer | LiveViewer:
+) -> Viewer | LiveViewer | SceneViewer:
     """A viewer that serves from now on.
 
     Args:
@@ -55,6 +56,10 @@ def open_viewer(
         if len(sources) > 1:
             raise InputError("view", "source", "a live stream is shown by itself; name nothing beside it")
         return LiveViewer(sources[0], place)
+    if is_scene_folder(Path(sources[0])):
+        if len(sources) > 1:
+            raise InputError("view", "source", "a scene is shown by itself; name nothing beside it")
+        return SceneViewer(Path(sources[0]), place, video)
     footage = None if video is None else Footage(video, offset or 0.0)
     if footage is not None:
         probe_video(footage.path)
