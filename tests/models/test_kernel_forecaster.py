@@ -485,7 +485,9 @@ def test_a_run_with_one_that_goes_on_frame_by_frame_learns_keeps_ships_and_reads
     with torch.no_grad():
         assert torch.equal(kept.continued(seen), others[0](seen))
     # The kernel's rows lie otherwise in memory: its last digits may differ.
-    torch.testing.assert_close(told, motion_forecasts._curves(learned, seen), atol=1e-5, rtol=1e-6)
+    torch.testing.assert_close(
+        told, motion_forecasts._curves(learned, seen, made, dataset.humanoid), atol=1e-5, rtol=1e-6
+    )
     torch.testing.assert_close(told, by_hand(0, seen), atol=1e-4, rtol=1e-4)
     without = mixed(networks[:1], kernels[0], 0.3, seen)
     assert (told - without)[:, 0].abs().max() > 0.05
@@ -523,7 +525,7 @@ def test_a_run_from_before_there_was_a_kernel_forecasts_by_its_networks_alone(fo
     RunCheckpoint(kept).save(tmp_path / FOLDER, metadata=metadata_of("motion forecaster", size, 0, 0, 0.0))
     assert [name for name in PARTS if has_component(tmp_path / FOLDER, name)] == ["members"]
     pasts = torch.randn(3, CONTEXT, StateLayout.of_pose_size(size).size)
-    expected = motion_forecasts._curves(Members(networks, None, 0.0), pasts[..., :size])
+    expected = motion_forecasts._curves(Members(networks, None, 0.0), pasts[..., :size], made, dataset.humanoid)
     assert torch.equal(ForecastCurves(config, dataset, tmp_path)(pasts), expected)
     seen = pasts[..., :size]
     by_hand = sum(network((seen - network.mean) / network.std) * network.std + network.mean for network in networks)
