@@ -58,7 +58,8 @@ def test_every_job_of_the_study_files_composes(name: str, least: int) -> None:
     study = yaml.safe_load((STUDY / name).read_text())
     jobs = list_jobs(study)
     assert len(jobs) >= least
-    own = {row["table"]: row["budget"] for row in study["tables"] if "budget" in row}
+    rows = [row for row in study["tables"] if "budget" in row]
+    own = {(row["table"], method): row["budget"] for row in rows for method in row["methods"]}
     seen: set[str] = set()
     for job in jobs:
         if {job.method, job.fold, job.protocol} <= seen:
@@ -67,7 +68,7 @@ def test_every_job_of_the_study_files_composes(name: str, least: int) -> None:
         words = [*job.overrides, *job.evaluate, "data.folder=nowhere"]
         config = compose_config("baseline" if job.verb == "baseline" else "train", words)
         if job.verb != "regressor":
-            assert config["training"]["total_steps"] == own.get(job.table, study["budget"])
+            assert config["training"]["total_steps"] == own.get((job.table, job.method), study["budget"])
     for settings in {j.settings for j in jobs}:
         compose_config("evaluate", ["checkpoint=none", *settings])
 
