@@ -222,13 +222,6 @@ def test_weights_that_cannot_be_shown_are_left_out_and_none_is_an_error(
         demo.run_demo([f"output={tmp_path / 'none'}"])
 
 
-def test_after_training_no_video_is_rendered_for_another_camera(staged: list[str], tmp_path: Path) -> None:
-    config = compose_config("train", ["experiment=train_demo", "vision.camera.shake=[1.0, 2.0]"])
-    assert demo.show_shipped(config, tmp_path, {}, render=False) == {}
-    assert staged == []
-    assert len(demo.show_shipped(compose_config("train", ["experiment=train_demo"]), tmp_path, {}, render=False)) == 2
-
-
 @pytest.mark.parametrize(
     ("words", "told"),
     [

@@ -15,7 +15,7 @@ from egopose.checkpoint.pretrained import ABOUT, PREFIX, pretrained_names, pretr
 from egopose.core import safe_io
 from egopose.core.config import compose_config, from_mapping
 from egopose.core.errors import InputError
-from egopose.data.preparation import flow_name, prepare, store_folder
+from egopose.data.preparation import prepare
 from egopose.evaluation.agents import survival_figures
 from egopose.evaluation.demo_page import DemoPageSettings, write_demo_page
 from egopose.evaluation.estimation_run import run_evaluation, summary
@@ -43,7 +43,7 @@ def run_demo(overrides: list[str]) -> Path:
     config, folder = _begun("demo", overrides)
     seconds: dict[str, float] = {}
     print("egopose demo: a walk of an unseen person -> rendered wearer's video -> estimate and forecast -> page")
-    written = show_shipped(config, folder, seconds, render=True)
+    written = show_shipped(config, folder, seconds)
     if not written:
         raise InputError("demo", "data", "no pretrained weights can be shown on it")
     with _stage("page", seconds):
@@ -106,27 +106,24 @@ def run_training_demo(budget: str, overrides: list[str]) -> Path:
         beaten = "" if name == "policy" else f"   policy survives {ratios[name]:.2f} times as long"
         print(f"  {name.replace('_', ' '):<20}{result['frames']:>7.1f}{beaten}")
 
-    shipped = show_shipped(agent.config, folder / "evaluation", seconds, render=False)
     minutes = (time.monotonic() - began) / 60
     report = {"budget": budget, "minutes": minutes, "seconds": seconds, "survival_train": figures}
-    report |= {"policy_over": ratios, "shipped": _paths(shipped)}
+    report |= {"policy_over": ratios}
     (folder / "demo.json").write_text(json.dumps(report, indent=1))
     print(f"\n{minutes:.1f} minutes; run, checkpoints, tables and videos: {folder}", flush=True)
     return folder
 
 
-def show_shipped(config: Mapping[str, Any], out: Path, seconds: dict[str, float], *, render: bool) -> dict[str, Path]:
+def show_shipped(config: Mapping[str, Any], out: Path, seconds: dict[str, float]) -> dict[str, Path]:
     """Estimates and forecasts, by the weights that ship with the package, of the test fragments of ``config``'s data.
 
-    Nobody seen in the embedded clips was seen in their training: they learned from other people of the same
-    collection. Prints the figures; writes what an evaluation writes. Weights whose task is scored by neither estimates
-    nor forecasts are passed over.
+    Meant for ``conf/data/demo``, whose people no weights have learned from. Prints the figures; writes what an
+    evaluation writes. Weights whose task is scored by neither estimates nor forecasts are passed over.
 
     Args:
         config: resolved, with ``data`` and ``demo.shipped``.
         out: for a folder of each.
         seconds: of each stage, in their order; those of this one are added.
-        render: whether data may be prepared for weights made for another body or camera; without, they are left out.
 
     Returns:
         The folder of each, by name; those that cannot be shown are left out, with a line.
@@ -135,9 +132,6 @@ def show_shipped(config: Mapping[str, Any], out: Path, seconds: dict[str, float]
     for name in filter(is_scored, pretrained_names()):
         own = read_json(find_checkpoint(f"{PREFIX}{name}"), "config")
         seen = {**own, "data": config["data"]}
-        if not render and (store_folder(seen), flow_name(seen)) != (store_folder(config), flow_name(config)):
-            print(f"\n{PREFIX}{name}: made for another body or camera than this data's; left out", flush=True)
-            continue
         protocol = task_of(own).protocol
         settings = compose_config("evaluate", [f"checkpoint={PREFIX}{name}", *_looks(config, protocol)])
         print(f"\n{PREFIX}{name} on frames of people it has not seen (docs/model-card.md):", flush=True)
