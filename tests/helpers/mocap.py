@@ -9,11 +9,14 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
+import pytest
+
 from egopose.core.config import compose_config
 from egopose.humanoid.config import HumanoidConfig, SimConfig
 from egopose.humanoid.model import HumanoidModel, build_humanoid
 from egopose.motion.io import read_motion
 from egopose.motion.motion import Motion
+from egopose.pipeline import mocap_sources
 
 #: A file of each rig under ``shared/data``; a tar's member after the colon.
 RIGS = {
@@ -56,6 +59,13 @@ def short_clips(folder: Path) -> list[str]:
         f"data.store={folder / 'store'}",
         "sim=fast",
     ]
+
+
+def hold_out_the_turn(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let ``sources.cmu6=FOLDER/mocap`` be :func:`short_clips`, whose turn is held out."""
+    composed = compose_config("train", short_clips(folder))
+    composed["data"]["split"] = {"kind": "subject", "test_subjects": ["turn"], "shortest": 8, "subjects": None}
+    monkeypatch.setattr(mocap_sources, "compose_config", lambda name, words: composed)
 
 
 def rig_motion(rig: str, shared: Path, folder: Path, seconds: float = 6.0) -> Motion:

@@ -10,13 +10,12 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from helpers.mocap import default_humanoid, short_clips
+from helpers.mocap import default_humanoid, hold_out_the_turn
 from helpers.walking import walking
 
 from egopose.checkpoint.contacts import load_contact_network
 from egopose.core.config import compose_config, from_mapping
 from egopose.core.errors import InputError
-from egopose.pipeline import mocap_sources
 from egopose.pipeline.contacts import train_contacts
 from egopose.training.contact_network import (
     ContactClip,
@@ -99,9 +98,7 @@ def test_settings_that_cannot_be_are_refused(changed: dict[str, Any], name: str)
 def test_the_command_trains_judges_and_saves(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    composed = compose_config("train", short_clips(tmp_path))
-    composed["data"]["split"] = {"kind": "subject", "test_subjects": ["turn"], "shortest": 8, "subjects": None}
-    monkeypatch.setattr(mocap_sources, "compose_config", lambda name, words: composed)
+    hold_out_the_turn(tmp_path, monkeypatch)
     out = tmp_path / "network"
     words = [f"sources.cmu6={tmp_path / 'mocap'}", "whole=[]", f"out={out}", "training.widths=[16]"]
     values = compose_config("contacts", [*words, "training.epochs=1", "training.batch=8", "training.bfloat16=false"])

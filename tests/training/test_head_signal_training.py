@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from helpers.mocap import default_humanoid, short_clips
+from helpers.mocap import default_humanoid, hold_out_the_turn
 from helpers.walking import walking
 
 from egopose.checkpoint.head_signal import load_head_signal_regressor, save_head_signal_regressor
@@ -21,7 +21,6 @@ from egopose.models.pose_regression import integrated_path, state_to_qpos
 from egopose.models.regressor import StateRegressor
 from egopose.motion import rotations as rot
 from egopose.motion.rotations import Array
-from egopose.pipeline import mocap_sources
 from egopose.pipeline.head_signal import make_head_signal_regressor, motions_of, train_head_signal
 from egopose.training.head_signal_figures import held_out_figures
 from egopose.training.head_signal_regressor import (
@@ -184,9 +183,7 @@ def test_the_mirror_of_a_motion_gives_the_mirror_of_its_example() -> None:
 @pytest.fixture
 def small(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
     """The command's configuration with one source, two short embedded clips; one of them is a test person's."""
-    composed = compose_config("train", short_clips(tmp_path))
-    composed["data"]["split"] = {"kind": "subject", "test_subjects": ["turn"], "shortest": 8, "subjects": None}
-    monkeypatch.setattr(mocap_sources, "compose_config", lambda name, words: composed)
+    hold_out_the_turn(tmp_path, monkeypatch)
     training = [f"training.{name}={list(v) if isinstance(v, tuple) else v!s}" for name, v in TINY.items()]
     source = [f"sources.cmu6={tmp_path / 'mocap'}", "whole=[]", f"out={tmp_path / 'regressor'}"]
     return compose_config("head_signal", [*source, *training])

@@ -10,14 +10,13 @@ from typing import Any
 
 import pytest
 import torch
-from helpers.mocap import default_humanoid, short_clips
+from helpers.mocap import default_humanoid, hold_out_the_turn
 from helpers.walking import walking
 from torch import Tensor
 
 from egopose.checkpoint.lifting import load_lifting_network
 from egopose.core.config import compose_config, from_mapping
 from egopose.core.errors import InputError
-from egopose.pipeline import mocap_sources
 from egopose.pipeline.lifting import train_lifter
 from egopose.scene.lifting import JOINTS, KEYPOINTS, SEEN, WINDOW
 from egopose.training.lifting_data import SightSettings, body_offsets, draw_windows, joint_parents, joint_turns
@@ -114,9 +113,7 @@ def test_settings_that_cannot_be_are_refused(changed: dict[str, Any], name: str)
 def test_the_command_trains_judges_and_saves(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    composed = compose_config("train", short_clips(tmp_path))
-    composed["data"]["split"] = {"kind": "subject", "test_subjects": ["turn"], "shortest": 8, "subjects": None}
-    monkeypatch.setattr(mocap_sources, "compose_config", lambda name, words: composed)
+    hold_out_the_turn(tmp_path, monkeypatch)
     out = tmp_path / "lifter"
     words = [f"sources.cmu6={tmp_path / 'mocap'}", "whole=[]", f"out={out}", "training.width=16"]
     values = compose_config("lifter", [*words, "training.epochs=1", "training.batch=8", "training.bfloat16=false"])

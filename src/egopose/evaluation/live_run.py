@@ -70,7 +70,7 @@ def live_estimates(
         body = live_body(trained, guard, planner, copies)
         poses = _poses(live_regression(trained, lookahead, planner), body, features)
         truth = torch.as_tensor(agent.dataset.reference["qpos"][start]).double().numpy()
-        found.append(_estimate(agent, fragment, start, poses, truth))
+        found.append(_estimate(trained.env, fragment, start, poses, truth, agent.dataset.takes.lowest_head_height))
     return found
 
 
@@ -91,19 +91,27 @@ def _poses(regression: CausalRegression, body: LiveBody, features: Tensor) -> li
     return [body.advance(row) for row in [*(row for row in seen if row is not None), *regression.drain()]]
 
 
-def _estimate(agent: Agent, fragment: FragmentLike, start: int, poses: Sequence[LivePose], truth: Array) -> Estimate:
-    """``poses`` moved so that the first stands at the place and heading of ``truth [nq]``."""
+def _estimate(
+    env: TransformedEnv,
+    fragment: FragmentLike,
+    start: int,
+    poses: Sequence[LivePose],
+    truth: Array,
+    lowest_head_height: Tensor,
+) -> Estimate:
+    """``poses`` moved so that the first stands at the place and heading of ``truth [nq]``.
+
+    ``lowest_head_height [takes]`` m is the data's: ``env``, the live body's, has but one take of its own.
+    """
     qpos = begun_at(np.stack([pose.qpos for pose in poses]), truth)
     reset = np.array([pose.reset for pose in poses])
     value, confidence = (
         np.array([np.nan if one is None else one for one in column], dtype=np.float64)
         for column in zip(*((pose.value, pose.confidence) for pose in poses), strict=True)
     )
-    env: TransformedEnv = agent.make_env("test", num_envs=1)
     base = env.base_env
     head = base.bodies(qpos, np.zeros((len(qpos), base.physics.model.nv))).xpos[:, base.problem.humanoid.head, 2]
-    lowest = float(base.problem.takes.lowest_head_height[fragment.take]) - base.problem.termination.head_drop
-    env.close()
+    lowest = float(lowest_head_height[fragment.take]) - base.problem.termination.head_drop
     return Estimate(
         start=start,
         qpos=qpos,

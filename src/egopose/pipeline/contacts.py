@@ -6,14 +6,12 @@ import json
 import sys
 from collections.abc import Mapping
 from dataclasses import asdict
-from pathlib import Path
 from typing import Any
 
 from egopose.checkpoint.contacts import save_contact_network
 from egopose.core.config import from_mapping
-from egopose.core.errors import InputError
 from egopose.data.preparation import humanoid_of
-from egopose.pipeline.mocap_sources import clips_of
+from egopose.pipeline.mocap_sources import clips_of, folder_to_make
 from egopose.training.contact_network import (
     ContactSettings,
     accuracy_table,
@@ -32,9 +30,7 @@ def train_contacts(values: Mapping[str, Any]) -> None:
     Raises:
         InputError: a source or a setting cannot be used, or ``out`` is there.
     """
-    out = Path(str(values["out"])).expanduser()
-    if out.exists():
-        raise InputError(out, "out", "is there already: remove it or name another folder")
+    out = folder_to_make(values)
     settings = from_mapping(ContactSettings, values["training"], f"{_SOURCE}: training")
     humanoid = humanoid_of(values)
     train, test = ([contact_clip(humanoid, clip, settings) for clip in part] for part in clips_of(values, _SOURCE))

@@ -145,15 +145,14 @@ def _futures(
 @torch.no_grad()
 def _curves(members: Members, contexts: Tensor, settings: ForecasterSettings, humanoid: HumanoidModel) -> Tensor:
     """Curve of the members ``[W, K, P]`` from contexts ``[W, C, P]``, in the pose's own units, grounded if asked."""
-    basis = spline_basis(settings.horizon + 1, settings.spacing, 1.0 / humanoid.control_dt)[0]
-    out = []
-    for part in contexts.split(512):
-        curve = _curve(members, part)
-        if settings.mass_ahead is not None:
+    curves = [_curve(members, part) for part in contexts.split(512)]
+    if settings.mass_ahead is not None:
+        basis = spline_basis(settings.horizon + 1, settings.spacing, 1.0 / humanoid.control_dt)[0]
+        fit = torch.linalg.pinv(basis.double())
+        for number, curve in enumerate(curves):
             poses = grounded((basis @ curve).double().numpy(), humanoid, settings.mass_ahead)
-            curve = torch.linalg.pinv(basis.double()).matmul(torch.from_numpy(poses)).float()
-        out.append(curve)
-    return torch.cat(out)
+            curves[number] = fit.matmul(torch.from_numpy(poses)).float()
+    return torch.cat(curves)
 
 
 def _curve(members: Members, contexts: Tensor) -> Tensor:

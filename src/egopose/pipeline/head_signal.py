@@ -9,10 +9,9 @@ from typing import Any
 
 from egopose.checkpoint.head_signal import save_head_signal_regressor
 from egopose.core.config import from_mapping
-from egopose.core.errors import InputError
 from egopose.data.preparation import humanoid_of
 from egopose.motion.rotations import Array
-from egopose.pipeline.mocap_sources import clips_of
+from egopose.pipeline.mocap_sources import clips_of, folder_to_make
 from egopose.training.head_signal_figures import held_out_figures
 from egopose.training.head_signal_regressor import HeadSignalSettings, train_head_signal_regressor
 
@@ -37,9 +36,7 @@ def make_head_signal_regressor(values: Mapping[str, Any]) -> dict[str, dict[str,
     Raises:
         InputError: a source or a setting cannot be used, or ``out`` is there.
     """
-    out = Path(str(values["out"])).expanduser()
-    if out.exists():
-        raise InputError(out, "out", "is there already: remove it or name another folder")
+    out = folder_to_make(values)
     settings = from_mapping(HeadSignalSettings, values["training"], f"{_SOURCE}: training")
     humanoid = humanoid_of(values)
     train, test = motions_of(values)

@@ -6,14 +6,12 @@ import json
 import sys
 from collections.abc import Mapping
 from dataclasses import asdict
-from pathlib import Path
 from typing import Any
 
 from egopose.checkpoint.lifting import save_lifting_network
 from egopose.core.config import from_mapping
-from egopose.core.errors import InputError
 from egopose.data.preparation import humanoid_of
-from egopose.pipeline.mocap_sources import clips_of
+from egopose.pipeline.mocap_sources import clips_of, folder_to_make
 from egopose.training.lifting_data import SightSettings
 from egopose.training.lifting_network import LifterSettings, lifting_errors, train_lifting_network
 
@@ -27,9 +25,7 @@ def train_lifter(values: Mapping[str, Any]) -> None:
     Raises:
         InputError: a source or a setting cannot be used, or ``out`` is there.
     """
-    out = Path(str(values["out"])).expanduser()
-    if out.exists():
-        raise InputError(out, "out", "is there already: remove it or name another folder")
+    out = folder_to_make(values)
     sight = from_mapping(SightSettings, values["sight"], f"{_SOURCE}: sight")
     settings = from_mapping(LifterSettings, values["training"], f"{_SOURCE}: training")
     humanoid = humanoid_of(values)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 from egopose.core.config import compose_config, convert
@@ -10,6 +11,14 @@ from egopose.core.errors import InputError
 from egopose.data.preparation import prepare
 from egopose.data.splits import WHOLE, split_takes
 from egopose.motion.motion import Motion
+
+
+def folder_to_make(values: Mapping[str, Any]) -> Path:
+    """``out``, where what is trained goes. Raises InputError: it is there."""
+    out = Path(str(values["out"])).expanduser()
+    if out.exists():
+        raise InputError(out, "out", "is there already: remove it or name another folder")
+    return out
 
 
 def clips_of(values: Mapping[str, Any], source: str) -> tuple[list[Motion], list[Motion]]:
