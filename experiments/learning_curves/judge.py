@@ -1,7 +1,7 @@
 """``python experiments/learning_curves/judge.py DATA_FOLDER NAME=CHECKPOINT ...``: policies on the same uniform starts.
 
 On people never seen, by how wrong the target motion is: frames survived by the mean action, and falls a minute of them.
-Writes ``raw/judged.json`` and prints a table. ``NAME=zero`` is the zero action.
+Adds to ``raw/judged.json`` and prints each policy's figures. ``NAME=zero`` is the zero action.
 """
 
 from __future__ import annotations
@@ -29,7 +29,8 @@ def main() -> None:
     config["task"]["starts"] = {"kind": "uniform"}
     dataset = load_dataset(config)
     pieces = len(dataset.test) // len(ERRORS)
-    judged: dict[str, dict[str, dict[str, float]]] = {}
+    raw = HERE / "raw" / "judged.json"
+    judged: dict[str, dict[str, dict[str, float]]] = json.loads(raw.read_text()) if raw.is_file() else {}
     for word in words:
         name, path = word.split("=", 1)
         judged[name] = {}
@@ -47,7 +48,7 @@ def main() -> None:
         print(
             name, {error: {k: round(v, 2) for k, v in row.items()} for error, row in judged[name].items()}, flush=True
         )
-    (HERE / "raw" / "judged.json").write_text(json.dumps(judged, indent=1) + "\n")
+    raw.write_text(json.dumps(judged, indent=1) + "\n")
 
 
 if __name__ == "__main__":
