@@ -12,7 +12,8 @@ from pathlib import Path
 
 import numpy as np
 
-from egopose.benchmarks.scene_truth import TruthSettings, touching, track, true_contacts
+from egopose.benchmarks.scene_contacts import touching, true_contacts
+from egopose.benchmarks.scene_truth import TruthSettings, track
 from egopose.benchmarks.scene_warp import Platform, Stance, boxes_under, lifted, stances
 from egopose.core.config import compose_config
 from egopose.data.preparation import humanoid_of
@@ -137,8 +138,8 @@ def make(humanoid: HumanoidModel, name: str, roots: list[Path]) -> str:
     off = np.linalg.norm(simulated.qpos[:, :3] - motion.qpos[:, :3], axis=1)
     others = [humanoid.skeleton.names[b] for b in np.flatnonzero(found.any(axis=(0, 2)))]
     return (
-        f"{name}: {len(motion)} frames, {len(boxes)} boxes, root {off.mean():.3f} m off the mocap, at most {off.max():.3f}"
-        f"; {', '.join(others)} touch; {time.time() - began:.0f} s"
+        f"{name}: {len(motion)} frames, {len(boxes)} boxes, root {off.mean():.3f} m off the mocap, "
+        f"at most {off.max():.3f}; {', '.join(others)} touch; {time.time() - began:.0f} s"
     )
 
 

@@ -9,20 +9,17 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 
 from egopose.humanoid.derivatives import Simulator, Single, state_difference
 from egopose.humanoid.foot_geometry import sole_positions
 from egopose.humanoid.inverse_dynamics import ForceSettings, with_forces
 from egopose.humanoid.model import HumanoidModel
-from egopose.humanoid.physics import BatchedPhysics
 from egopose.humanoid.trajectory import Followed, Nominal, TrackingCost, TrajectoryOptimiser, feed_forward
 from egopose.motion.motion import Motion, finite_difference
 from egopose.motion.rotations import Array
-from egopose.scene.clip import BODIES, box_poses
-from egopose.scene.contacts import FEET
-from egopose.scene.scene_file import FLOOR, Contact, Scene
+from egopose.scene.clip import box_poses
+from egopose.scene.scene_file import Scene
 from egopose.scene.simulated import SimulatedMotion
 
 _FORCES = ForceSettings(cutoff_hz=8.0, touch=0.05, lever=0.3, evenness=0.05)  # conf/tracker.yaml
@@ -46,7 +43,15 @@ class TruthSettings:
     reach: float = 1.0
     cost: TrackingCost = field(
         default_factory=lambda: TrackingCost(
-            place=30.0, height=60.0, turn=60.0, linear=1.0, angular=0.5, joints=2.0, joint_rates=0.01, control=0.5, last=3.0
+            place=30.0,
+            height=60.0,
+            turn=60.0,
+            linear=1.0,
+            angular=0.5,
+            joints=2.0,
+            joint_rates=0.01,
+            control=0.5,
+            last=3.0,
         )
     )
 
@@ -125,54 +130,3 @@ def _flat(humanoid: HumanoidModel, motion: Motion) -> Array:
 def _window(followed: Followed, at: int, horizon: int) -> Followed:
     states, steps = slice(at, at + horizon + 1), slice(at, at + horizon)
     return Followed(followed.qpos[:, states], followed.qvel[:, states], followed.ctrl[:, steps])
-
-
-def touching(humanoid: HumanoidModel, simulated: SimulatedMotion) -> NDArray[np.bool_]:
-    """``[T, B, 1 + K]``: which body touches the floor (first) and each box, by playing the motion again.
-
-    The first frame is as the second.
-
-    Raises:
-        RuntimeError: the motion does not come back to the bit.
-    """
-    physics = BatchedPhysics(humanoid.mj_model, 1, humanoid.substeps, body_ids=humanoid.body_ids, contacts=True)
-    physics.place_boxes([0], simulated.box_tops[None], simulated.box_headings[None])
-    physics.set_state([0], simulated.qpos[:1], simulated.qvel[:1])
-    rows = []
-    for t, ctrl in enumerate(simulated.ctrl):
-        physics.step(ctrl[None])
-        if not np.array_equal(physics.qpos[0], simulated.qpos[t + 1]):
-            raise RuntimeError(f"the simulation does not come back at frame {t + 1}")
-        rows.append(np.concatenate([physics.floor_contacts[0][:, None], physics.box_contacts[0]], axis=1))
-    physics.close()
-    found = np.stack([rows[0], *rows])
-    out = np.zeros((len(simulated), len(humanoid.skeleton.names), found.shape[2]), dtype=bool)
-    out[:, humanoid.touching] = found
-    return out
-
-
-def true_contacts(
-    humanoid: HumanoidModel, scene: Scene, found: NDArray[np.bool_], shortest: int = 2
-) -> tuple[Contact, ...]:
-    """Contacts of hands and feet from ``found [T, B, 1 + K]``; gaps and contacts of one frame are left out."""
-    names = [FLOOR, *(box.name for box in scene.boxes)]
-    out = []
-    for effector, body in BODIES.items():
-        rows = found[:, humanoid.skeleton.index(body)]
-        for column, name in enumerate(names):
-            edges = np.flatnonzero(np.diff(np.concatenate([[0], rows[:, column].astype(np.int8), [0]])))
-            runs = [(int(a), int(b) - 1) for a, b in zip(edges[::2], edges[1::2], strict=True)]
-            joined: list[tuple[int, int]] = []
-            for first, last in runs:
-                if joined and first - joined[-1][1] <= shortest:
-                    joined[-1] = (joined[-1][0], last)
-                else:
-                    joined.append((first, last))
-            out += [Contact(effector, name, a, b) for a, b in joined if b - a + 1 >= shortest]
-    return tuple(sorted(out, key=lambda one: (one.first, one.effector)))
-
-
-def feet_touching(humanoid: HumanoidModel, found: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """``[T, 2]``: right and left foot touch anything, of ``found [T, B, 1 + K]``."""
-    rows = [humanoid.skeleton.index(BODIES[f"{side}_foot"]) for side in FEET]
-    return np.asarray(found[:, rows].any(axis=2))

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -89,9 +90,7 @@ def stances(humanoid: HumanoidModel, motion: Motion, speed: float = 0.35, lownes
     return sorted(out, key=lambda stance: (stance.start, stance.foot))
 
 
-def lifted(
-    humanoid: HumanoidModel, motion: Motion, standing: Sequence[Stance], heights: Sequence[float]
-) -> Motion:
+def lifted(humanoid: HumanoidModel, motion: Motion, standing: Sequence[Stance], heights: Sequence[float]) -> Motion:
     """The motion with each stance at its height, m over where it was.
 
     Raises:
@@ -127,7 +126,7 @@ def _foot_height(frames: int, foot: int, standing: Sequence[Stance], heights: Se
     if not own:
         return out
     out[: own[0][0].stop], out[own[-1][0].start :] = own[0][1], own[-1][1]
-    for (one, low), (other, high) in zip(own, own[1:], strict=False):
+    for (one, low), (other, high) in pairwise(own):
         swing = np.arange(one.stop - 1, other.start + 1)
         share = (swing - swing[0]) / max(swing[-1] - swing[0], 1)
         # What the other foot stands on meanwhile lies on the way.

@@ -163,7 +163,9 @@ def penetration(points: Array, scene: Scene) -> Array:
     for box in scene.boxes:
         if not box.known:
             continue
-        assert box.place is not None and box.yaw is not None and box.height is not None
+        assert box.place is not None
+        assert box.yaw is not None
+        assert box.height is not None
         c, s = np.cos(box.yaw), np.sin(box.yaw)
         local = (points[..., :2] - box.place) @ np.array([[c, -s], [s, c]])
         sides = (0.5 * np.array(box.size) - np.abs(local)).min(axis=-1)
