@@ -7,7 +7,7 @@ they are.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +18,7 @@ from egopose.humanoid.model import HumanoidModel
 from egopose.motion import rotations as rot
 from egopose.motion.motion import Motion
 from egopose.motion.rotations import Array
+from egopose.scene.clip import box_poses
 from egopose.scene.scene_file import Scene
 
 #: m off the true pelvis at which a clip is lost.
@@ -131,12 +132,12 @@ def box_errors(found: Scene, true: Scene, turn: float, shift: Array) -> dict[str
         turn, shift: of :func:`aligned`.
     """
     c, s = np.cos(turn), np.sin(turn)
-    places = {b.name: np.array([[c, -s], [s, c]]) @ b.place + shift for b in found.boxes if b.known}
-    heights = {b.name: b.height for b in found.boxes if b.known}
-    truth = {b.name: b for b in true.boxes if b.known}
+    places, heights = _placed(found)
+    truth, true_heights = _placed(true)
+    places = {name: np.array([[c, -s], [s, c]]) @ place + shift for name, place in places.items()}
     pairs = {name: name for name in truth if name in places}
     apart = sorted(
-        (float(np.linalg.norm(places[one] - truth[name].place)), name, one)
+        (float(np.linalg.norm(places[one] - truth[name])), name, one)
         for name in truth
         for one in places
         if name not in pairs and one not in pairs
@@ -144,8 +145,8 @@ def box_errors(found: Scene, true: Scene, turn: float, shift: Array) -> dict[str
     for distance, name, one in apart:
         if distance <= _SAME_BOX and name not in pairs and one not in pairs.values():
             pairs[name] = one
-    place = [float(np.linalg.norm(places[one] - truth[name].place)) for name, one in pairs.items()]
-    height = [abs(float(heights[one] or 0.0) - float(truth[name].height or 0.0)) for name, one in pairs.items()]
+    place = [float(np.linalg.norm(places[one] - truth[name])) for name, one in pairs.items()]
+    height = [abs(heights[one] - true_heights[name]) for name, one in pairs.items()]
     return {
         "box_place_m": float(np.mean(place)) if place else float("nan"),
         "box_height_m": float(np.mean(height)) if height else float("nan"),
@@ -160,14 +161,23 @@ def penetration(points: Array, scene: Scene) -> Array:
     In a box, depth is the shortest way out, up or to a side.
     """
     deepest = np.maximum(-points[..., 2], 0.0)
-    for box in scene.boxes:
-        if not box.known:
-            continue
-        assert box.place is not None
-        assert box.yaw is not None
-        assert box.height is not None
-        c, s = np.cos(box.yaw), np.sin(box.yaw)
-        local = (points[..., :2] - box.place) @ np.array([[c, -s], [s, c]])
+    known = _known(scene)
+    for box, top, yaw in zip(known.boxes, *box_poses(known), strict=True):
+        c, s = np.cos(yaw), np.sin(yaw)
+        local = (points[..., :2] - top[:2]) @ np.array([[c, -s], [s, c]])
         sides = (0.5 * np.array(box.size) - np.abs(local)).min(axis=-1)
-        deepest = np.maximum(deepest, np.minimum(sides, box.height - points[..., 2]))
+        deepest = np.maximum(deepest, np.minimum(sides, top[2] - points[..., 2]))
     return np.asarray(deepest.max(axis=-1))
+
+
+def _known(scene: Scene) -> Scene:
+    """With the boxes whose place, height and yaw are there."""
+    return replace(scene, boxes=tuple(box for box in scene.boxes if box.known), contacts=())
+
+
+def _placed(scene: Scene) -> tuple[dict[str, Array], dict[str, float]]:
+    """Places ``[2]`` and heights of the boxes, m, by name."""
+    known = _known(scene)
+    tops, _ = box_poses(known)
+    names = [box.name for box in known.boxes]
+    return {n: top[:2] for n, top in zip(names, tops, strict=True)}, dict(zip(names, tops[:, 2].tolist(), strict=True))
