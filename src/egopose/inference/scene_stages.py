@@ -24,6 +24,7 @@ from egopose.motion.rotations import Array
 from egopose.scene.articulation import articulated
 from egopose.scene.balance import lean, leaned
 from egopose.scene.camera import CameraTrack, camera_motion
+from egopose.scene.camera_file import given_camera, load_camera, save_camera
 from egopose.scene.contacts import FEET, LOWER_BODY, ContactNetwork, estimate_contacts
 from egopose.scene.lifting import LiftingNetwork, lifted_track
 from egopose.scene.poses.blazepose import BlazePose
@@ -103,9 +104,12 @@ def _read(values: Mapping[str, Any], poses: Path, video: Path | None, at: tuple[
 
 
 def follow_camera(values: Mapping[str, Any], sources: Sources, folder: Path, advance: Advance, out: Path) -> None:
-    """``camera.npz``: by the film's background; a camera that stands where there is no film."""
+    """``camera.npz``: given, else by the film's background; a camera that stands where there is no film."""
     track = load_track(folder / "poses.npz")
-    if sources.video is None:
+    given = convert(values["camera"]["track"], str | None, _SOURCE, "camera.track")
+    if given is not None:
+        camera = given_camera(Path(given).expanduser(), len(track))
+    elif sources.video is None:
         frames = len(track)
         camera = CameraTrack(np.tile(np.eye(3), (frames, 1, 1)), np.zeros(frames, bool), np.ones(frames), "similarity")
     else:
@@ -127,18 +131,6 @@ def _as_many(frames: Iterable[Frame], count: int) -> Iterator[Frame]:
     while number < count and last is not None:
         number += 1
         yield last
-
-
-def save_camera(camera: CameraTrack, path: Path) -> None:
-    kind = np.frombuffer(camera.kind.encode(), dtype=np.uint8)
-    np.savez_compressed(path, to_first=camera.to_first, degenerate=camera.degenerate, alike=camera.alike, kind=kind)
-
-
-def load_camera(path: Path) -> CameraTrack:
-    """Read what :func:`save_camera` wrote."""
-    arrays = read_arrays(path, ("to_first", "degenerate", "alike", "kind"))
-    kind = arrays["kind"].tobytes().decode()
-    return CameraTrack(arrays["to_first"], arrays["degenerate"], arrays["alike"], kind)
 
 
 def mend(folder: Path, sources: Sources, out: Path) -> None:
