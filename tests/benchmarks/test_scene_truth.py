@@ -31,17 +31,15 @@ def test_standing_feet_are_lifted_and_the_pelvis_follows(humanoid: HumanoidModel
     motion = walk(humanoid)
     standing = stances(humanoid, motion)
     assert {s.foot for s in standing} == {0, 1}
-    heights = [0.2 if k == len(standing) - 1 else 0.0 for k in range(len(standing))]
+    heights = [0.1 if k == len(standing) - 1 else 0.0 for k in range(len(standing))]
     up = lifted(humanoid, motion, standing, heights)
     raised = (sole_positions(humanoid, up) - sole_positions(humanoid, motion))[..., 2].reshape(len(motion), 2, 2)
     for stance, height in zip(standing, heights, strict=True):
-        middle = slice(stance.start + 1, stance.stop - 1)
-        assert raised[middle, stance.foot] == pytest.approx(
-            np.full((stance.stop - stance.start - 2, 2), height), abs=0.01
-        )
+        middle = raised[stance.start + 1 : stance.stop - 1, stance.foot]
+        np.testing.assert_allclose(middle, height, atol=0.025)
     pelvis = up.qpos[:, 2] - motion.qpos[:, 2]
     assert pelvis.min() > -0.01
-    assert pelvis.max() <= 0.2
+    assert pelvis.max() <= 0.1
     assert np.abs(np.diff(pelvis, n=2)).max() * 900 < 20  # m/s^2
 
 
