@@ -35,7 +35,7 @@ class Recipe:
     """A clip: where its mocap lies, which frames at 30 frames/s, and what the feet stand on.
 
     ``real``: the steps were there when it was recorded, so nothing is lifted. ``bodies`` track it side by side: jumps
-    fail one body in some.
+    fail one body in some. ``hands`` stand on things, too.
     """
 
     file: str
@@ -45,6 +45,7 @@ class Recipe:
     real: bool = False
     skip: int = 0
     bodies: int = 1
+    hands: bool = False
 
 
 RECIPES = {
@@ -85,6 +86,7 @@ RECIPES = {
     "jump_down": Recipe(
         "cmu_cgspeed_daz/01_01.bvh", 300, 375, (Platform("box", 0, 20, 0.4, (0.15, 0.15), NORTH),), skip=4
     ),
+    "vault": Recipe("humanoid3d_cartwheel.txt", 0, 82, (Platform("box", 33, 48, 0.25, (0.1, 0.1), NORTH),), hands=True),
     "walk_turn": Recipe("long/humanoid3d_long_walk1.txt", 20, 140),
     "cartwheel": Recipe("humanoid3d_cartwheel.txt", 0, 82),
 }
@@ -94,7 +96,7 @@ def reference(humanoid: HumanoidModel, recipe: Recipe, source: Motion) -> tuple[
     """The mocap on the humanoid and when its feet stand; the lowest floor lies at 0."""
     if not recipe.real:
         motion = reference_motion(source, humanoid)[0].slice(recipe.first, recipe.last)
-        return motion, stances(humanoid, motion)
+        return motion, stances(humanoid, motion, hands=recipe.hands)
     fast = source.resample(60.0) if source.fps > 60.0 else source
     motion = low_pass(retarget(fast, humanoid.skeleton, humanoid.joint_range)[0], 8.0).resample(30.0)
     motion = motion.slice(recipe.first, recipe.last)

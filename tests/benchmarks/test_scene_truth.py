@@ -30,12 +30,12 @@ def walk(humanoid: HumanoidModel) -> Motion:
 def test_standing_feet_are_lifted_and_the_pelvis_follows(humanoid: HumanoidModel) -> None:
     motion = walk(humanoid)
     standing = stances(humanoid, motion)
-    assert {s.foot for s in standing} == {0, 1}
+    assert {s.limb for s in standing} == {0, 1}
     heights = [0.1 if k == len(standing) - 1 else 0.0 for k in range(len(standing))]
     up = lifted(humanoid, motion, standing, heights)
     raised = (sole_positions(humanoid, up) - sole_positions(humanoid, motion))[..., 2].reshape(len(motion), 2, 2)
     for stance, height in zip(standing, heights, strict=True):
-        middle = raised[stance.start + 1 : stance.stop - 1, stance.foot]
+        middle = raised[stance.start + 1 : stance.stop - 1, stance.limb]
         np.testing.assert_allclose(middle, height, atol=0.025)
     pelvis = up.qpos[:, 2] - motion.qpos[:, 2]
     assert pelvis.min() > -0.01
@@ -46,10 +46,10 @@ def test_standing_feet_are_lifted_and_the_pelvis_follows(humanoid: HumanoidModel
 def test_a_box_lies_under_all_soles_that_stand_on_it(humanoid: HumanoidModel) -> None:
     motion = walk(humanoid)
     standing = stances(humanoid, motion)
-    platform = Platform("box", standing[-1].start, standing[-1].stop, 0.2, (0.05, 0.1), yaw=0.3, foot=standing[-1].foot)
+    platform = Platform("box", standing[-1].start, standing[-1].stop, 0.2, (0.05, 0.1), yaw=0.3, limb=standing[-1].limb)
     (box,) = boxes_under(humanoid, motion, standing, [platform])
     stance = standing[-1]
-    corners = sole_edges(humanoid, motion).reshape(len(motion), 2, -1, 3)[stance.start : stance.stop, stance.foot]
+    corners = sole_edges(humanoid, motion).reshape(len(motion), 2, -1, 3)[stance.start : stance.stop, stance.limb]
     c, s = np.cos(box.yaw), np.sin(box.yaw)
     local = (corners[..., :2] - box.place) @ np.array([[c, -s], [s, c]])
     assert (np.abs(local) <= 0.5 * np.array(box.size) - [0.04, 0.09]).all()
@@ -58,7 +58,7 @@ def test_a_box_lies_under_all_soles_that_stand_on_it(humanoid: HumanoidModel) ->
 
 
 def test_a_body_that_nobody_stands_on_is_refused(humanoid: HumanoidModel) -> None:
-    with pytest.raises(ValueError, match="no foot"):
+    with pytest.raises(ValueError, match="nothing ever"):
         lifted(humanoid, walk(humanoid), [], [])
 
 
