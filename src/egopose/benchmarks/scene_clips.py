@@ -13,6 +13,7 @@ from egopose.benchmarks.scene_contacts import feet_touching, touching
 from egopose.core.errors import InputError
 from egopose.evaluation.scene_metrics import SceneMotion
 from egopose.humanoid.model import HumanoidModel
+from egopose.motion.contacts import without_short_runs
 from egopose.motion.motion import Motion
 from egopose.scene.clip import humanoid_in
 from egopose.scene.scene_file import Scene, read_scene
@@ -20,6 +21,7 @@ from egopose.scene.simulated import SimulatedMotion, load_simulated
 from egopose.scene.virtual_camera import KINDS
 
 _SOURCE = "bench scenes"
+_LONGEST_GAP = 2  # frames
 _SWITCH = {"true": True, "yes": True, "false": False, "no": False}
 NOISES = ("measured", "hard", "none")
 BOXES = ("guessed", "none")
@@ -133,6 +135,8 @@ def read_true_clip(folder: Path, humanoid: HumanoidModel) -> TrueClip:
 def simulated_feet(path: Path, simulated: SimulatedMotion, scene: Scene, humanoid: HumanoidModel) -> NDArray[np.bool_]:
     """``[T, 2]`` whether the right and the left foot touch anything, by playing a motion again.
 
+    Gaps of one or two frames are filled: sensors tell of the last substep alone.
+
     Raises:
         InputError: it is of another body or other boxes, or does not come back; names ``path``.
     """
@@ -143,6 +147,7 @@ def simulated_feet(path: Path, simulated: SimulatedMotion, scene: Scene, humanoi
         cause = f"coordinates, controls and boxes are {shapes}, not {(model.nq, model.nu, len(scene.boxes))}"
         raise InputError(path, "qpos", cause)
     try:
-        return feet_touching(among, touching(among, simulated))
+        feet = feet_touching(among, touching(among, simulated))
+        return ~without_short_runs(~feet, _LONGEST_GAP + 1)
     except RuntimeError as error:
         raise InputError(path, "ctrl", str(error)) from None

@@ -135,7 +135,8 @@ def prepare(folder: Path) -> None:
     """``egopose reconstruct prepare`` on ``folder/seen``; results go to ``folder``."""
     seen_in = folder / "seen"
     words = [f"poses={seen_in / 'poses.npz'}", f"camera.track={seen_in / 'camera.npz'}"]
-    values = compose_config("reconstruct", [*words, f"scene={seen_in / 'scene.yaml'}", f"out={folder}"])
+    words += [f"scene={seen_in / 'scene.yaml'}", f"out={folder}", "page.moments=4", "page.height=200"]
+    values = compose_config("reconstruct", words)
     prepare_scene(values, write_scene_page)
 
 
