@@ -19,7 +19,8 @@ def carriers(touches: NDArray[np.bool_]) -> NDArray[np.int64]:
     out = np.full(len(touches), FLOOR)
     now = 0
     since = np.full(touches.shape[2], -1)
-    for t, row in enumerate(touches.any(axis=1)):
+    touched: NDArray[np.bool_] = np.asarray(touches.any(axis=1))
+    for t, row in enumerate(touched):
         since = np.where(row, np.where(since < 0, t, since), -1)
         if row.any():
             now = int(np.where(row, since, len(touches)).argmin())

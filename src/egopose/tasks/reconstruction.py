@@ -88,12 +88,13 @@ class Reconstruction:
         task = config["task"]
         folder = Path(str(task["clip"])).expanduser()
         clip = read_clip(folder)
-        humanoid = humanoid_in(clip.scene, humanoid_of(config))
+        bare = humanoid_of(config)
+        humanoid = humanoid_in(clip.scene, bare)
         if len(clip) < 2:
             raise InputError(folder / "body.npz", "frames", "a clip needs two frames at least")
         try:
             writable = replace(clip.body, qpos=clip.body.qpos.copy())
-            reference = reference_states(humanoid_of(config), writable)
+            reference = reference_states(bare, writable)
         except ValueError as error:
             raise InputError(folder / "body.npz", "body", str(error)) from None
         plan = None if not task["start_from"] else _plan(Path(str(task["start_from"])).expanduser(), clip, humanoid)
@@ -182,10 +183,8 @@ def touching_points(humanoid: HumanoidModel) -> TouchingPoints:
 def ranges_of(scene: Scene) -> SceneRanges:
     """What the scene leaves free of its boxes."""
     tops, headings = box_poses(scene)
-    span = np.array([[box.free.get(name, (0.0, 0.0)) for name in FREE] for box in scene.boxes]).reshape(
-        -1, len(FREE), 2
-    )
-    low, high = torch.from_numpy(span).unbind(-1)
+    span = np.array([[box.free.get(name, (0.0, 0.0)) for name in FREE] for box in scene.boxes])
+    low, high = torch.from_numpy(span.reshape(-1, len(FREE), 2)).unbind(-1)
     return SceneRanges(torch.from_numpy(tops), torch.from_numpy(headings), low.contiguous(), high.contiguous(), DEPTH)
 
 

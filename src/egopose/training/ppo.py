@@ -144,9 +144,7 @@ class PPO:
         self.in_bfloat16 = settings.in_bfloat16
         self.recurrent = is_recurrent(actor) or is_recurrent(critic)
         if self.recurrent and settings.adaptive_sampling is not None:
-            raise InputError(
-                "conf/algo", "adaptive_sampling", "takes tuples apart; a memory learns from whole sequences"
-            )
+            raise InputError("conf/algo", "adaptive_sampling", "takes tuples apart: not for networks with a memory")
         # Of the actor only its distribution: `_losses` runs its network, once for all that reads the mean action.
         self.loss = ClipPPOLoss(
             actor.module[-1],

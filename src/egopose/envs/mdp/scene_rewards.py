@@ -100,8 +100,8 @@ def distance_to_zone(points: Tensor, scene: Tensor, half: Tensor, edge: Tensor) 
 def target_zone(view: StepView, *, scale: float, hands: str) -> Tensor:
     """r_dist = c exp(-scale sum_l mindist(Z_l, p_l)^2) ``[N]`` (equation 10, scale 15).
 
-    The sum is over the contacts with boxes that are on. The zone is the centre quarter of the upper face. With ``hands: edge`` the hands' zone is the face's border: the
-    paper's way out where a body should hold on to a box.
+    The sum is over the contacts with boxes that are on. The zone is the centre quarter of the upper face. With
+    ``hands: edge`` the hands' zone is the face's border: the paper's way out where a body should hold on to a box.
     """
     if hands not in ("centre", "edge"):
         raise ValueError(f"hands must be centre or edge, not {hands!r}")
