@@ -104,7 +104,7 @@ class ReconstructionProblem(ImitationProblem):
         super().__init__(humanoid, reference, takes, reward, action, ends, targets)
         bodies = len(humanoid.body_ids)
         self.hints, self.ranges, self.start, self.varies = hints, ranges, start, varies
-        self.sees_scene = sees_scene
+        self.sees_scene, self.touching = sees_scene, touching
         self.layout = replace(self.layout, touching=touching, rates=LinkRates(humanoid.mj_model, humanoid.body_ids))
         self.endings = ENDINGS
         asked = {name for name in ENDINGS if getattr(endings, name) is not None}

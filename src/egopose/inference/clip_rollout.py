@@ -1,0 +1,91 @@
+"""A reconstruction's policy over its whole clip: the mean action from the first frame on, and the motion it makes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torchrl.envs import TransformedEnv
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+
+from egopose.envs.env import EgoPoseEnv
+from egopose.envs.mdp.rotations import yaw
+from egopose.envs.reconstruction import ReconstructionProblem
+from egopose.envs.test_time import Controller, prepare_for_test
+from egopose.motion.rotations import Array
+from egopose.scene.simulated import SimulatedMotion
+
+
+@dataclass(frozen=True)
+class ClipRollout:
+    """What a policy made of a clip.
+
+    Args:
+        motion: states, controls and boxes.
+        rewards: ``[T - 1]`` of each step.
+        terms: each term ``[T - 1]``.
+        ended: frames from which on each ending would have ended the episode; None where it never would.
+        touched: ``[T - 1, 4, 1 + K]`` what the end effectors touched after each step.
+    """
+
+    motion: SimulatedMotion
+    rewards: Array
+    terms: Mapping[str, Array]
+    ended: Mapping[str, int | None]
+    touched: NDArray[np.bool_]
+
+    @property
+    def survived(self) -> int:
+        """Frames until the first ending, the first frame included."""
+        return min([frame for frame in self.ended.values() if frame is not None], default=len(self.motion))
+
+
+@torch.no_grad()
+def roll_out(env: TransformedEnv, actor: Controller, frames: int) -> ClipRollout:
+    """One world from the episode's first frame to the last of ``frames``.
+
+    Args:
+        env: of one world, whose endings end nothing; its boxes are those of the first states.
+        actor: its mean action is taken.
+        frames: T, of the motion.
+    """
+    base = env.base_env
+    assert isinstance(base, EgoPoseEnv)
+    problem, physics = base.problem, base.physics
+    assert isinstance(problem, ReconstructionProblem)
+    problem.varies = False
+    prepare_for_test(env, actor)
+    observation = env.reset()
+    qpos, qvel, ctrl = [physics.qpos[0].copy()], [physics.qvel[0].copy()], []
+    rewards, touched = [], []
+    terms: dict[str, list[float]] = {name: [] for name in problem.reward.names}
+    ended: dict[str, int | None] = dict.fromkeys((*problem.endings, "diverged"))
+    tops = physics.box_tops[0].copy()
+    headings = yaw(torch.from_numpy(physics.box_quaternions[0].copy())).numpy()
+    with set_exploration_type(ExplorationType.DETERMINISTIC):
+        for t in range(1, frames):
+            acted = actor(observation)
+            ctrl.append(problem.target(acted["action"], torch.tensor([t]))[0].numpy())
+            after = env.step(acted)["next"]
+            qpos.append(physics.qpos[0].copy())
+            qvel.append(physics.qvel[0].copy())
+            rewards.append(float(after["reward"]))
+            for name in terms:
+                terms[name].append(float(after["reward_terms", name]))
+            for name in ended:
+                if ended[name] is None and bool(after[name]):
+                    ended[name] = t
+            touched.append(_touched(problem, base))
+            observation = after.exclude("reward", "action")
+    motion = SimulatedMotion(np.stack(qpos), np.stack(qvel), np.stack(ctrl), tops, headings)
+    figures = {name: np.array(values) for name, values in terms.items()}
+    return ClipRollout(motion, np.array(rewards), figures, ended, np.stack(touched))
+
+
+def _touched(problem: ReconstructionProblem, base: EgoPoseEnv) -> NDArray[np.bool_]:
+    bodies = problem.touching.bodies.numpy()
+    floor, boxes = base.physics.floor_contacts[0, bodies], base.physics.box_contacts[0, bodies]
+    return np.concatenate([floor[:, None], boxes], axis=1)
