@@ -231,8 +231,11 @@ def _start(dataset: ClipDataset, touches: Tensor, ranges: SceneRanges) -> StartS
     qpos, qvel = dataset.reference["qpos"].double(), dataset.reference["qvel"].double()
     if plan is None:
         return StartStates(qpos, qvel, support, torch.zeros_like(ranges.low))
-    change = ranges.change(torch.from_numpy(plan.box_tops), torch.from_numpy(plan.box_headings))
-    return StartStates(torch.from_numpy(plan.qpos), torch.from_numpy(plan.qvel), support, change)
+    # Copies: files are read into arrays that cannot be written to.
+    qpos, qvel, tops, headings = (
+        torch.tensor(part) for part in (plan.qpos, plan.qvel, plan.box_tops, plan.box_headings)
+    )
+    return StartStates(qpos, qvel, support, ranges.change(tops, headings))
 
 
 TASK = Reconstruction()
