@@ -130,14 +130,22 @@ class ReconstructionProblem(ImitationProblem):
             tops, headings = boxes[..., :3], yaw(boxes[..., 3:])
         else:
             tops, headings = body.qpos.new_zeros(len(frame), 0, 3), body.qpos.new_zeros(len(frame), 0)
-        return self.observations_among(body, frame, tops, headings)
+        return self.observations_among(body, frame, body.qpos[:, :7], tops, headings)
 
-    def observations_among(self, body: BodyView, frame: Tensor, tops: Tensor, headings: Tensor) -> dict[str, Tensor]:
-        """:meth:`observations` with boxes ``tops [N, K, 3]`` m and ``headings [N, K]`` rad; differentiable in them."""
+    def observations_among(
+        self, body: BodyView, frame: Tensor, root: Tensor, tops: Tensor, headings: Tensor
+    ) -> dict[str, Tensor]:
+        """:meth:`observations` of bodies with ``root [N, 7]`` among boxes; differentiable in root and boxes.
+
+        Args:
+            body: of the links.
+            frame: ``[N]``.
+            root: place and quaternion.
+            tops: ``[N, K, 3]`` m. headings: ``[N, K]`` rad.
+        """
         phase = (frame.double() / max(1, self.n_frames - 1))[:, None]
         parts = [phase, links_in_root_frame(body)]
         if self.sees_scene:
-            root = body.qpos[:, :7]
             parts += [up_in_root_frame(root[:, 3:]), root[:, 2:3], boxes_from_root(root, tops, headings)]
         change = self.ranges.change(tops, headings)
         return {"humanoid_state": torch.cat(parts, dim=-1), "scene_parameters": self.ranges.parameters(change)}

@@ -80,7 +80,7 @@ class PlanSchool:
         body = BodyView({name: torch.from_numpy(value) for name, value in arrays.items()}, self._problem.layout)
         plan, count = self._teacher.plan, len(frame)
         tops, headings = torch.tensor(plan.box_tops), torch.tensor(plan.box_headings)
-        among = tops.expand(count, -1, -1), headings.expand(count, -1)
+        among = body.qpos[:, :7], tops.expand(count, -1, -1), headings.expand(count, -1)
         seen = self._problem.observations_among(body, torch.from_numpy(frame), *among)
         return seen["humanoid_state"].float(), seen["scene_parameters"].float()
 
