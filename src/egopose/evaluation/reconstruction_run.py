@@ -12,17 +12,21 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 
 from egopose.core.atomic_write import write_text_whole
 from egopose.core.errors import InputError
 from egopose.envs.starts import Piece
 from egopose.evaluation import position_metrics
-from egopose.inference.clip_rollout import ClipRollout, roll_out
+from egopose.inference.clip_rollout import ClipRollout, after, roll_out
+from egopose.inference.scene_values import window_value
 from egopose.motion.motion import Motion
 from egopose.pipeline.agent import Agent
-from egopose.tasks.reconstruction import ClipDataset, touches_of
+from egopose.scene.fitting import changed_scene, fit_parameters
+from egopose.scene.scene_file import FREE, write_scene
+from egopose.tasks.reconstruction import ClipDataset, ranges_of, touches_of, window_of
 
-MOTION, FIGURES = "simulated.npz", "figures.json"
+MOTION, FIGURES, SCENE, FIT = "simulated.npz", "figures.json", "scene_by_values.yaml", "scene_fit.json"
 
 
 def figures_of(rollout: ClipRollout, dataset: ClipDataset) -> dict[str, Any]:
@@ -34,10 +38,11 @@ def figures_of(rollout: ClipRollout, dataset: ClipDataset) -> dict[str, Any]:
     """
     clip, humanoid = dataset.clip, dataset.humanoid
     assert clip is not None
-    frames = len(rollout.motion)
+    frames, first = len(rollout.motion), rollout.first
+    shown_now = slice(first, first + frames)
     motion = Motion(humanoid.skeleton, rollout.motion.qpos, clip.body.fps)
-    made, shown = motion.forward_kinematics()[0], clip.body.forward_kinematics()[0][:frames]
-    wanted = touches_of(clip, humanoid).numpy()[1:frames].any(axis=-1)
+    made, shown = motion.forward_kinematics()[0], clip.body.forward_kinematics()[0][shown_now]
+    wanted = touches_of(clip, humanoid).numpy()[shown_now][1:].any(axis=-1)
     right = rollout.touched.any(axis=-1) == wanted
     return {
         "frames": frames,
@@ -69,17 +74,59 @@ def run_reconstruction(
         folder = out if len(agents) == 1 else out / str(number)
         folder.mkdir(parents=True, exist_ok=True)
         assert isinstance(agent.dataset, ClipDataset)
-        whole = Piece(0, 0, agent.dataset.train[0].stop)
+        fragment, plan = agent.dataset.train[0], agent.dataset.plan
+        piece = Piece(0, fragment.start, fragment.stop)
         env = agent.make_env(
-            num_envs=1, threads=int(values["threads"]), whole_fragments=True, falls_end=False, fragments=[whole]
+            num_envs=1, threads=int(values["threads"]), whole_fragments=True, falls_end=False, fragments=[piece]
         )
-        rollout = roll_out(env, agent.actor, whole.stop)
+        rollout = roll_out(env, agent.actor, piece)
         env.close()
         figures = figures_of(rollout, agent.dataset)
-        rollout.motion.save(folder / MOTION)
+        motion = rollout.motion if plan is None else after(rollout, plan)
+        motion.save(folder / MOTION)
         write_text_whole(folder / FIGURES, json.dumps(figures, indent=1))
         lines.append(summary(figures) + f"\nmotion: {folder / MOTION}")
-    return "\n".join(lines)
+    fit = fitted_scene(agents, out)
+    return "\n".join([*lines, *([] if fit is None else [fit])])
+
+
+def fitted_scene(agents: Sequence[Agent], out: Path) -> str | None:
+    """The scene that the value networks of the agents' windows like best, left in ``out``; a line that tells of it.
+
+    None where nothing of the scene is free.
+
+    Raises:
+        InputError: the agents are not of one clip.
+    """
+    datasets = [agent.dataset for agent in agents]
+    clip = datasets[0].clip if isinstance(datasets[0], ClipDataset) else None
+    assert clip is not None
+    if len({str(agent.config["task"]["clip"]) for agent in agents}) > 1:
+        raise InputError(agents[1].path, "task.clip", "is another clip than that of the first checkpoint")
+    ranges = ranges_of(clip.scene)
+    if not ranges.size:
+        return None
+    values = []
+    for agent in agents:
+        window = window_of(agent.config, clip)
+        last = agent.dataset.train[0].stop - 1
+        values.append(window_value(agent, ranges, window.start, min(window.hand_over, last)))
+    fit = fit_parameters(values, ranges.size)
+    change = ranges.change_of(torch.from_numpy(fit.parameters))
+    tops, headings = ranges.changed(change)
+    out.mkdir(parents=True, exist_ok=True)
+    write_scene(changed_scene(clip.scene, tops.numpy(), headings.numpy()), out / SCENE)
+    names = [f"{box.name}.{name}" for box in clip.scene.boxes for name in FREE if _spans(box.free.get(name))]
+    changes = dict(zip(names, change[ranges.free].tolist(), strict=True))
+    told = {name: value.tolist() if hasattr(value, "tolist") else value for name, value in vars(fit).items()}
+    write_text_whole(out / FIT, json.dumps({"changes": changes, **told}, indent=1))
+    gained = f"{fit.gains.sum():.2f}, {fit.guessed.sum():.2f} as guessed"
+    each = ", ".join(f"{name} {value:+.2f}" for name, value in changes.items())
+    return f"scene by the values ({gained}): {each}\nscene: {out / SCENE}"
+
+
+def _spans(span: tuple[float, float] | None) -> bool:
+    return span is not None and span[1] > span[0]
 
 
 def summary(figures: Mapping[str, Any]) -> str:

@@ -64,11 +64,6 @@ class Simulator:
         )
         self.steps = 0
 
-    def place_boxes(self, tops: Array, headings: Array) -> None:
-        """Put the boxes of every world: ``[K, 3]`` m and ``[K]`` rad, see :meth:`BatchedPhysics.place_boxes`."""
-        worlds = self._physics.num_envs
-        self._physics.place_boxes(slice(None), np.tile(tops, (worlds, 1, 1)), np.tile(headings, (worlds, 1)))
-
     def step(self, qpos: Array, qvel: Array, ctrl: Array) -> tuple[Array, Array]:
         """States ``[n, nq]``, ``[n, nv]`` a control step after those under ``ctrl [n, nu]``."""
         physics, after_qpos, after_qvel = self._physics, np.empty_like(qpos), np.empty_like(qvel)

@@ -14,6 +14,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from egopose.envs.env import EgoPoseEnv
 from egopose.envs.mdp.rotations import yaw
 from egopose.envs.reconstruction import ReconstructionProblem
+from egopose.envs.starts import Piece
 from egopose.envs.test_time import Controller, prepare_for_test
 from egopose.motion.rotations import Array
 from egopose.scene.simulated import SimulatedMotion
@@ -24,14 +25,16 @@ class ClipRollout:
     """What a policy made of a clip.
 
     Args:
-        motion: states, controls and boxes.
+        motion: states, controls and boxes; its first frame is ``first`` of the clip.
+        first: see ``motion``.
         rewards: ``[T - 1]`` of each step.
         terms: each term ``[T - 1]``.
-        ended: frames from which on each ending would have ended the episode; None where it never would.
+        ended: frames of the motion from which on each ending would have ended the episode; None where it never would.
         touched: ``[T - 1, 4, 1 + K]`` what the end effectors touched after each step.
     """
 
     motion: SimulatedMotion
+    first: int
     rewards: Array
     terms: Mapping[str, Array]
     ended: Mapping[str, int | None]
@@ -44,13 +47,13 @@ class ClipRollout:
 
 
 @torch.no_grad()
-def roll_out(env: TransformedEnv, actor: Controller, frames: int) -> ClipRollout:
-    """One world from the episode's first frame to the last of ``frames``.
+def roll_out(env: TransformedEnv, actor: Controller, piece: Piece) -> ClipRollout:
+    """One world from the first frame of ``piece`` to its last.
 
     Args:
         env: of one world, whose endings end nothing; its boxes are those of the first states.
         actor: its mean action is taken.
-        frames: T, of the motion.
+        piece: of the clip.
     """
     base = env.base_env
     assert isinstance(base, EgoPoseEnv)
@@ -66,7 +69,7 @@ def roll_out(env: TransformedEnv, actor: Controller, frames: int) -> ClipRollout
     tops = physics.box_tops[0].copy()
     headings = yaw(torch.from_numpy(physics.box_quaternions[0].copy())).numpy()
     with set_exploration_type(ExplorationType.DETERMINISTIC):
-        for t in range(1, frames):
+        for t in range(piece.start + 1, piece.stop):
             acted = actor(observation)
             ctrl.append(problem.target(acted["action"], torch.tensor([t]))[0].numpy())
             after = env.step(acted)["next"]
@@ -77,15 +80,27 @@ def roll_out(env: TransformedEnv, actor: Controller, frames: int) -> ClipRollout
                 terms[name].append(float(after["reward_terms", name]))
             for name in ended:
                 if ended[name] is None and bool(after[name]):
-                    ended[name] = t
+                    ended[name] = t - piece.start
             touched.append(_touched(problem, base))
             observation = after.exclude("reward", "action")
     motion = SimulatedMotion(np.stack(qpos), np.stack(qvel), np.stack(ctrl), tops, headings)
     figures = {name: np.array(values) for name, values in terms.items()}
-    return ClipRollout(motion, np.array(rewards), figures, ended, np.stack(touched))
+    return ClipRollout(motion, piece.start, np.array(rewards), figures, ended, np.stack(touched))
 
 
 def _touched(problem: ReconstructionProblem, base: EgoPoseEnv) -> NDArray[np.bool_]:
     bodies = problem.touching.bodies.numpy()
     floor, boxes = base.physics.floor_contacts[0, bodies], base.physics.box_contacts[0, bodies]
     return np.concatenate([floor[:, None], boxes], axis=1)
+
+
+def after(rollout: ClipRollout, before: SimulatedMotion) -> SimulatedMotion:
+    """The motion of the rollout, and until it begins that of ``before``, whose states it begins in."""
+    first, motion = rollout.first, rollout.motion
+    return SimulatedMotion(
+        np.concatenate([before.qpos[:first], motion.qpos]),
+        np.concatenate([before.qvel[:first], motion.qvel]),
+        np.concatenate([before.ctrl[:first], motion.ctrl]),
+        motion.box_tops,
+        motion.box_headings,
+    )

@@ -6,7 +6,7 @@ the root is nobody tells the policy or its reward. The folder of the clip is the
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -38,6 +38,7 @@ from egopose.scene.clip import BODIES, Clip, box_poses, humanoid_in, read_clip, 
 from egopose.scene.scene_file import FREE, Scene
 from egopose.scene.simulated import SimulatedMotion, load_simulated
 from egopose.scene.up_hint import up_hint
+from egopose.scene.windows import Window, windows
 from egopose.tasks.dataset import Dataset
 from egopose.tasks.task import Sources
 
@@ -98,10 +99,13 @@ class Reconstruction:
         except ValueError as error:
             raise InputError(folder / "body.npz", "body", str(error)) from None
         plan = None if not task["start_from"] else _plan(Path(str(task["start_from"])).expanduser(), clip, humanoid)
-        frames = len(clip) if plan is None else min(len(clip), len(plan))
+        window = window_of(config, clip)
+        last = window.stop if plan is None else min(window.stop, len(plan))
+        if last - window.start < 2:
+            raise InputError(_SOURCE, "task.start_from", f"has {len(plan or clip)} frames: too few for the window")
         head = reference["xpos"][:, humanoid.head, 2].min()
         takes = TakeTable(torch.tensor([0]), torch.tensor([len(clip)]), head[None].double())
-        pieces = [Piece(0, 0, frames)]
+        pieces = [Piece(0, window.start, last)]
         return ClipDataset(humanoid, reference, takes, pieces, pieces, clip=clip, plan=plan)
 
     def followed(self, config: Mapping[str, Any], dataset: Dataset) -> Dataset:
@@ -120,7 +124,7 @@ class Reconstruction:
         termination = {**task["termination"], **({} if endings_end is None else {"enabled": endings_end})}
         touches = touches_of(clip, humanoid)
         touching = touching_points(humanoid)
-        ranges = ranges_of(clip.scene)
+        ranges = ranges_of(clip.scene, window_of(config, clip).boxes)
         action = from_mapping(ActionSettings, task["action"], "task.action")
         if task["targets"] == "plan":
             action = replace(action, velocity_feedforward=0.0)
@@ -180,10 +184,26 @@ def touching_points(humanoid: HumanoidModel) -> TouchingPoints:
     return TouchingPoints(torch.tensor(bodies), torch.from_numpy(np.stack(points)), humanoid.head)
 
 
-def ranges_of(scene: Scene) -> SceneRanges:
-    """What the scene leaves free of its boxes."""
+def window_of(config: Mapping[str, Any], clip: Clip) -> Window:
+    """The part of the clip that ``task.window`` names; all of it, with all of its boxes, for None.
+
+    Raises:
+        InputError: the clip has no such window.
+    """
+    number = config["task"]["window"]
+    if number is None:
+        return Window(1, tuple(box.name for box in clip.scene.boxes), 0, len(clip), len(clip))
+    there = windows(clip.scene.contacts, len(clip))
+    if not 1 <= int(number) <= len(there):
+        raise InputError(_SOURCE, "task.window", f"{number} must be from 1 to {len(there)}, the windows of this clip")
+    return there[int(number) - 1]
+
+
+def ranges_of(scene: Scene, boxes: Collection[str] | None = None) -> SceneRanges:
+    """What the scene leaves free of its boxes; of those that ``boxes`` does not name, nothing."""
     tops, headings = box_poses(scene)
-    span = np.array([[box.free.get(name, (0.0, 0.0)) for name in FREE] for box in scene.boxes])
+    free = [box.free if boxes is None or box.name in boxes else {} for box in scene.boxes]
+    span = np.array([[ranges.get(name, (0.0, 0.0)) for name in FREE] for ranges in free])
     low, high = torch.from_numpy(span.reshape(-1, len(FREE), 2)).unbind(-1)
     return SceneRanges(torch.from_numpy(tops), torch.from_numpy(headings), low.contiguous(), high.contiguous(), DEPTH)
 
