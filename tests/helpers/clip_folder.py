@@ -7,10 +7,15 @@ from pathlib import Path
 
 import numpy as np
 
+from egopose.core.config import compose_config
+from egopose.data.preparation import humanoid_of
 from egopose.humanoid.foot_geometry import sole_positions
+from egopose.humanoid.physics import BatchedPhysics
 from egopose.motion.contacts import contact_labels
 from egopose.motion.io.native import write_native
+from egopose.scene.clip import box_poses, humanoid_in, read_clip
 from egopose.scene.scene_file import Box, Contact, Scene, write_scene
+from egopose.scene.simulated import SimulatedMotion
 from helpers.mocap import default_humanoid
 from helpers.walking import walking
 
@@ -37,3 +42,23 @@ def scene_of_a_step(frames: int = 24) -> Scene:
         Contact("right_foot", "step", frames // 2 + 3, frames - 1),
     )
     return Scene(boxes=(box,), contacts=contacts)
+
+
+def standing_plan(folder: Path, frames: int) -> SimulatedMotion:
+    """A simulated motion of a clip's folder: its first frames by the clip's joint angles as controls."""
+    clip = read_clip(folder)
+    humanoid = humanoid_in(clip.scene, humanoid_of(compose_config("train")))
+    physics = BatchedPhysics(humanoid.mj_model, 1, humanoid.substeps)
+    tops, headings = box_poses(clip.scene)
+    qvel = np.zeros((1, humanoid.mj_model.nv))
+    physics.set_state(slice(None), clip.body.qpos[:1], qvel)
+    if len(headings):
+        physics.place_boxes(slice(None), tops[None], headings[None])
+    states, rates = [physics.qpos[0].copy()], [physics.qvel[0].copy()]
+    ctrl = clip.body.qpos[1:frames, 7:]
+    for target in ctrl:
+        physics.step(target[None])
+        states.append(physics.qpos[0].copy())
+        rates.append(physics.qvel[0].copy())
+    physics.close()
+    return SimulatedMotion(np.stack(states), np.stack(rates), ctrl, tops, headings)

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import torch
 from torch import Tensor
 
+from egopose.collection.stepping import parts_of, run_parts
 from egopose.envs.mdp.observations import BodyView
 from egopose.envs.problem import Scene
 from egopose.envs.reconstruction import ReconstructionProblem
@@ -32,6 +35,7 @@ def window_value(agent: Agent, whole: SceneRanges, start: int, stop: int) -> Win
     normalizer = next(module for module in env.transform.modules() if isinstance(module, StateNormalizer))
     env.close()
     frames = torch.tensor([start, stop])
+    critic = parts_of(agent.critic)
     placer = Placer(problem.humanoid.mj_model, problem.humanoid.body_ids)
 
     def value(e: Tensor) -> Tensor:
@@ -40,10 +44,9 @@ def window_value(agent: Agent, whole: SceneRanges, start: int, stop: int) -> Win
         qpos, qvel = problem.first_state(frames, Scene(tops, headings, used))
         seen = problem.observations_among(_placed(problem, placer, qpos, qvel), frames, qpos[:, :7], tops, headings)
         state = normalizer.normalize(seen["humanoid_state"].float())
-        parts = {"humanoid_state": state, "scene_parameters": seen["scene_parameters"].float()}
-        network = next(module for module in agent.critic.modules() if hasattr(module, "in_keys"))
-        values = network.module(*(parts[str(key)] for key in network.in_keys)).squeeze(-1)
-        return values[0] - values[1]
+        parts: dict[Any, Tensor] = {"humanoid_state": state, "scene_parameters": seen["scene_parameters"].float()}
+        run_parts(critic, parts)
+        return parts["state_value"][0, 0] - parts["state_value"][1, 0]
 
     return value
 
