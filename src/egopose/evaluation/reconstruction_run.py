@@ -93,7 +93,7 @@ def run_reconstruction(
 def fitted_scene(agents: Sequence[Agent], out: Path) -> str | None:
     """The scene that the value networks of the agents' windows like best, left in ``out``; a line that tells of it.
 
-    None where nothing of the scene is free.
+    None where nothing of the scene is free, or a policy was trained among boxes that stand still.
 
     Raises:
         InputError: the agents are not of one clip.
@@ -104,7 +104,7 @@ def fitted_scene(agents: Sequence[Agent], out: Path) -> str | None:
     if len({str(agent.config["task"]["clip"]) for agent in agents}) > 1:
         raise InputError(agents[1].path, "task.clip", "is another clip than that of the first checkpoint")
     ranges = ranges_of(clip.scene)
-    if not ranges.size:
+    if not ranges.size or not all(agent.config["task"]["scene"]["vary"] for agent in agents):
         return None
     values = []
     for agent in agents:
