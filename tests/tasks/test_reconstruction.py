@@ -93,7 +93,7 @@ def test_evaluate_leaves_a_motion_that_physics_plays_again_to_the_bit(run: Path,
     assert "frames until an ending" in told
     assert "scene by the values" in told
     motion = load_simulated(tmp_path / "out" / "simulated.npz")
-    assert len(motion) == 12, "as long as the plan that episodes begin in"
+    assert len(motion) == 24
     humanoid = load_agent(run).dataset.humanoid
     physics = BatchedPhysics(humanoid.mj_model, 1, humanoid.substeps)
     physics.set_state(slice(None), motion.qpos[:1], motion.qvel[:1])
@@ -103,7 +103,7 @@ def test_evaluate_leaves_a_motion_that_physics_plays_again_to_the_bit(run: Path,
         np.testing.assert_array_equal(physics.qpos[0], motion.qpos[t + 1])
     physics.close()
     figures = json.loads((tmp_path / "out" / "figures.json").read_text())
-    assert figures["frames"] == 12
+    assert figures["frames"] == 24
     assert 0 < figures["mpjpe"] < 1000
     assert set(figures["terms"]) >= {"clip_pose", "up_hint", "contact_match", "landing"}
     fit = json.loads((tmp_path / "out" / "scene_fit.json").read_text())

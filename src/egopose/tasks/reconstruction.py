@@ -100,12 +100,9 @@ class Reconstruction:
             raise InputError(folder / "body.npz", "body", str(error)) from None
         plan = None if not task["start_from"] else _plan(Path(str(task["start_from"])).expanduser(), clip, humanoid)
         window = window_of(config, clip)
-        last = window.stop if plan is None else min(window.stop, len(plan))
-        if last - window.start < 2:
-            raise InputError(_SOURCE, "task.start_from", f"has {len(plan or clip)} frames: too few for the window")
         head = reference["xpos"][:, humanoid.head, 2].min()
         takes = TakeTable(torch.tensor([0]), torch.tensor([len(clip)]), head[None].double())
-        pieces = [Piece(0, window.start, last)]
+        pieces = [Piece(0, window.start, window.stop)]
         return ClipDataset(humanoid, reference, takes, pieces, pieces, clip=clip, plan=plan)
 
     def followed(self, config: Mapping[str, Any], dataset: Dataset) -> Dataset:
@@ -247,14 +244,16 @@ def _targets(source: str, clip: Clip, plan: SimulatedMotion | None) -> Tensor:
 
 
 def _start(dataset: ClipDataset, touches: Tensor, ranges: SceneRanges) -> StartStates:
+    """The plan's states, and behind its end the kinematic body's."""
     plan, support = dataset.plan, torch.from_numpy(carriers(touches.numpy()))
     qpos, qvel = dataset.reference["qpos"].double(), dataset.reference["qvel"].double()
     if plan is None:
         return StartStates(qpos, qvel, support, torch.zeros_like(ranges.low))
     # Copies: files are read into arrays that cannot be written to.
-    qpos, qvel, tops, headings = (
-        torch.tensor(part) for part in (plan.qpos, plan.qvel, plan.box_tops, plan.box_headings)
-    )
+    tops, headings = torch.tensor(plan.box_tops), torch.tensor(plan.box_headings)
+    known = min(len(plan), len(qpos))
+    qpos = torch.cat([torch.tensor(plan.qpos[:known]), qpos[known:]])
+    qvel = torch.cat([torch.tensor(plan.qvel[:known]), qvel[known:]])
     return StartStates(qpos, qvel, support, ranges.change(tops, headings))
 
 
