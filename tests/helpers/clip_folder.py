@@ -44,6 +44,17 @@ def scene_of_a_step(frames: int = 24) -> Scene:
     return Scene(boxes=(box,), contacts=contacts)
 
 
+def scene_of_two_steps(frames: int = 24) -> Scene:
+    """:func:`scene_of_a_step`, and a box beyond it for the left foot in the last frames."""
+    one = scene_of_a_step(frames)
+    second = Box("second", (0.4, 0.8), (1.5, 0.0), 0.3, 0.0, {"height": (-0.2, 0.2)})
+    return replace(
+        one,
+        boxes=(*one.boxes, second),
+        contacts=(*one.contacts, Contact("left_foot", "second", frames - 4, frames - 1)),
+    )
+
+
 def standing_plan(folder: Path, frames: int) -> SimulatedMotion:
     """A simulated motion of a clip's folder: its first frames by the clip's joint angles as controls."""
     clip = read_clip(folder)

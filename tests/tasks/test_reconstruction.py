@@ -5,23 +5,25 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from helpers.clip_folder import clip_folder, scene_of_a_step, standing_plan
+from helpers.clip_folder import clip_folder, scene_of_a_step, scene_of_two_steps, standing_plan
 from helpers.mocap import default_humanoid
 
 from egopose.core.config import compose_config
 from egopose.core.errors import InputError
 from egopose.envs.starts import Piece
+from egopose.evaluation.reconstruction_run import one_after_the_other
 from egopose.evaluation.run import evaluate
 from egopose.humanoid.physics import BatchedPhysics
 from egopose.inference.clip_rollout import after, roll_out
 from egopose.inference.scene_values import window_value
-from egopose.pipeline.agent import load_agent
+from egopose.pipeline.agent import Agent, load_agent
 from egopose.scene.clip import read_clip
 from egopose.scene.scene_file import read_scene
 from egopose.scene.simulated import load_simulated
@@ -39,12 +41,12 @@ SMALL = (
     "training.evaluate_every=0",
     "training.checkpoint_every=1",
 )
-CLONING = ("task.cloning.rounds=2", "task.cloning.bodies=8", "task.cloning.seconds=0.2", "task.cloning.nearby=1")
+CLONING = ("task.cloning.rounds=2", "task.cloning.bodies=8", "task.cloning.steps=40", "task.cloning.nearby=1")
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    out = clip_folder(tmp_path_factory.mktemp("clip") / "step", scene_of_a_step())
+    out = clip_folder(tmp_path_factory.mktemp("clip") / "step", scene_of_two_steps())
     standing_plan(out, 12).save(out / "plan.npz")
     return out
 
@@ -107,7 +109,7 @@ def test_evaluate_leaves_a_motion_that_physics_plays_again_to_the_bit(run: Path,
     assert 0 < figures["mpjpe"] < 1000
     assert set(figures["terms"]) >= {"clip_pose", "up_hint", "contact_match", "landing"}
     fit = json.loads((tmp_path / "out" / "scene_fit.json").read_text())
-    assert set(fit["changes"]) == {"step.along", "step.height"}
+    assert set(fit["changes"]) == {"step.along", "step.height", "second.height"}
     assert -0.1 <= fit["changes"]["step.height"] <= 0.2
     box = read_scene(tmp_path / "out" / "scene_by_values.yaml").box("step")
     assert box.height == pytest.approx(0.2 + fit["changes"]["step.height"], abs=1e-3)
@@ -118,11 +120,11 @@ def test_the_slope_of_a_windows_value_is_exact(run: Path) -> None:
     assert agent.dataset.clip is not None  # type: ignore[attr-defined]
     ranges = ranges_of(agent.dataset.clip.scene)  # type: ignore[attr-defined]
     value = window_value(agent, ranges, 0, 11)
-    e = torch.tensor([0.2, -0.4], dtype=torch.float64, requires_grad=True)
+    e = torch.tensor([0.2, -0.4, 0.1], dtype=torch.float64, requires_grad=True)
     (slope,) = torch.autograd.grad(value(e), e)
     step = 2e-3  # over which no unit of the network switches
-    for k in range(2):
-        apart = torch.zeros(2, dtype=torch.float64)
+    for k in range(3):
+        apart = torch.zeros(3, dtype=torch.float64)
         apart[k] = step
         with torch.no_grad():
             differences = (value(e + apart) - value(e - apart)) / (2 * step)
@@ -152,6 +154,23 @@ def test_a_rollout_of_a_later_window_goes_on_from_what_was_before(run: Path) -> 
     np.testing.assert_array_equal(whole.qpos[:5], plan.qpos[:5])
 
 
+def in_window(agent: Agent, number: int | None) -> Agent:
+    return replace(agent, config={**agent.config, "task": {**agent.config["task"], "window": number}})
+
+
+def test_policies_of_windows_act_one_after_the_other(run: Path) -> None:
+    """The same network twice: what it does is what it does alone, for nothing in it depends on the window."""
+    agent = load_agent(run, which="latest")
+    one = one_after_the_other([in_window(agent, 1)], threads=1)
+    two = one_after_the_other([in_window(agent, 1), in_window(agent, 2)], threads=1)
+    assert (len(two.motion), len(two.rewards), len(two.touched)) == (24, 23, 23)
+    np.testing.assert_array_equal(two.motion.qpos[:21], one.motion.qpos[:21])
+    # From the hand-over on physics is begun anew from the same state.
+    np.testing.assert_allclose(two.motion.qpos, one.motion.qpos, atol=1e-6)
+    with pytest.raises(InputError, match=r"task\.window: is None"):
+        one_after_the_other([agent], threads=1)
+
+
 def test_it_is_a_task_of_the_house(folder: Path) -> None:
     config = config_of(folder)
     assert task_of(config) is TASK
@@ -162,8 +181,9 @@ def test_it_is_a_task_of_the_house(folder: Path) -> None:
 
 def test_a_window_trains_on_its_frames_and_frees_its_boxes(folder: Path, tmp_path: Path) -> None:
     assert [tuple(piece) for piece in dataset_of(folder, "task.window=1").train] == [(0, 0, 24)]
-    with pytest.raises(InputError, match=r"task\.window: 2 must be from 1 to 1"):
-        dataset_of(folder, "task.window=2")
+    assert [tuple(piece) for piece in dataset_of(folder, "task.window=2").train] == [(0, 15, 24)]
+    with pytest.raises(InputError, match=r"task\.window: 3 must be from 1 to 2"):
+        dataset_of(folder, "task.window=3")
     assert ranges_of(scene_of_a_step(), ["other"]).size == 0
 
 
@@ -192,5 +212,5 @@ def test_what_does_not_fit_is_told(folder: Path, words: list[str], said: str) ->
 
 def test_a_plan_of_another_scene_is_told(folder: Path, tmp_path: Path) -> None:
     bare = clip_folder(tmp_path / "bare")
-    with pytest.raises(InputError, match="box_headings: has 1 boxes, the scene 0"):
+    with pytest.raises(InputError, match="box_headings: has 2 boxes, the scene 0"):
         dataset_of(bare, f"task.start_from={folder / 'plan.npz'}")

@@ -18,10 +18,12 @@ from egopose.core.atomic_write import write_text_whole
 from egopose.core.errors import InputError
 from egopose.envs.starts import Piece
 from egopose.evaluation import position_metrics
-from egopose.inference.clip_rollout import ClipRollout, after, roll_out
+from egopose.inference.clip_rollout import ClipRollout, after, joined, roll_out
 from egopose.inference.scene_values import window_value
 from egopose.motion.motion import Motion
+from egopose.motion.rotations import Array
 from egopose.pipeline.agent import Agent
+from egopose.scene.clip import Clip
 from egopose.scene.fitting import changed_scene, fit_parameters
 from egopose.scene.scene_file import FREE, write_scene
 from egopose.tasks.reconstruction import ClipDataset, ranges_of, touches_of, window_of
@@ -70,24 +72,62 @@ def run_reconstruction(
     if values["report"]:
         raise InputError("conf/evaluate.yaml", "report", "there is no such page of a reconstruction")
     lines = []
+    threads = int(values["threads"])
     for number, agent in enumerate(agents):
-        folder = out if len(agents) == 1 else out / str(number)
-        folder.mkdir(parents=True, exist_ok=True)
-        assert isinstance(agent.dataset, ClipDataset)
-        fragment, plan = agent.dataset.train[0], agent.dataset.plan
-        piece = Piece(0, fragment.start, fragment.stop)
-        env = agent.make_env(
-            num_envs=1, threads=int(values["threads"]), whole_fragments=True, falls_end=False, fragments=[piece]
-        )
-        rollout = roll_out(env, agent.actor, piece)
-        env.close()
-        figures = figures_of(rollout, agent.dataset)
-        motion = rollout.motion if plan is None else after(rollout, plan)
-        motion.save(folder / MOTION)
-        write_text_whole(folder / FIGURES, json.dumps(figures, indent=1))
-        lines.append(summary(figures) + f"\nmotion: {folder / MOTION}")
+        fragment = agent.dataset.train[0]
+        rollout = _acted_out(agent, Piece(0, fragment.start, fragment.stop), threads)
+        lines.append(_kept(rollout, agent, out if len(agents) == 1 else out / str(number)))
+    if len(agents) > 1:
+        lines.append("one after the other:\n" + _kept(one_after_the_other(agents, threads), agents[0], out))
     fit = fitted_scene(agents, out)
     return "\n".join([*lines, *([] if fit is None else [fit])])
+
+
+def one_after_the_other(agents: Sequence[Agent], threads: int) -> ClipRollout:
+    """The clip by the policies of its windows, each from the state in which the one before hands over.
+
+    Raises:
+        InputError: they are not the policies of one clip's windows from the first on, in their order.
+    """
+    clip = _clip_of(agents)
+    rollouts: list[ClipRollout] = []
+    for number, agent in enumerate(agents, start=1):
+        if agent.config["task"]["window"] != number:
+            cause = f"is {agent.config['task']['window']}: checkpoints must be those of windows 1, 2, ... in order"
+            raise InputError(agent.path, "task.window", cause)
+        window = window_of(agent.config, clip)
+        stop = window.stop if number == len(agents) else window.hand_over + 1
+        state = (rollouts[-1].motion.qpos[-1], rollouts[-1].motion.qvel[-1]) if rollouts else None
+        rollouts.append(_acted_out(agent, Piece(0, window.start, stop), threads, state))
+    return joined(rollouts)
+
+
+def _acted_out(agent: Agent, piece: Piece, threads: int, state: tuple[Array, Array] | None = None) -> ClipRollout:
+    env = agent.make_env(num_envs=1, threads=threads, whole_fragments=True, falls_end=False, fragments=[piece])
+    rollout = roll_out(env, agent.actor, piece, state)
+    env.close()
+    return rollout
+
+
+def _kept(rollout: ClipRollout, agent: Agent, folder: Path) -> str:
+    """Leave motion and figures in ``folder``; lines for the terminal."""
+    folder.mkdir(parents=True, exist_ok=True)
+    assert isinstance(agent.dataset, ClipDataset)
+    figures, plan = figures_of(rollout, agent.dataset), agent.dataset.plan
+    motion = rollout.motion if plan is None else after(rollout, plan)
+    motion.save(folder / MOTION)
+    write_text_whole(folder / FIGURES, json.dumps(figures, indent=1))
+    return f"{summary(figures)}\nmotion: {folder / MOTION}"
+
+
+def _clip_of(agents: Sequence[Agent]) -> Clip:
+    """Raises InputError: the agents are not of one clip."""
+    for agent in agents:
+        if agent.config["task"]["clip"] != agents[0].config["task"]["clip"]:
+            raise InputError(agent.path, "task.clip", "is another clip than that of the first checkpoint")
+    assert isinstance(agents[0].dataset, ClipDataset)
+    assert agents[0].dataset.clip is not None
+    return agents[0].dataset.clip
 
 
 def fitted_scene(agents: Sequence[Agent], out: Path) -> str | None:
@@ -98,11 +138,7 @@ def fitted_scene(agents: Sequence[Agent], out: Path) -> str | None:
     Raises:
         InputError: the agents are not of one clip.
     """
-    datasets = [agent.dataset for agent in agents]
-    clip = datasets[0].clip if isinstance(datasets[0], ClipDataset) else None
-    assert clip is not None
-    if len({str(agent.config["task"]["clip"]) for agent in agents}) > 1:
-        raise InputError(agents[1].path, "task.clip", "is another clip than that of the first checkpoint")
+    clip = _clip_of(agents)
     ranges = ranges_of(clip.scene)
     if not ranges.size or not all(agent.config["task"]["scene"]["vary"] for agent in agents):
         return None

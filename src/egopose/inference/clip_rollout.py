@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -47,13 +47,16 @@ class ClipRollout:
 
 
 @torch.no_grad()
-def roll_out(env: TransformedEnv, actor: Controller, piece: Piece) -> ClipRollout:
+def roll_out(
+    env: TransformedEnv, actor: Controller, piece: Piece, state: tuple[Array, Array] | None = None
+) -> ClipRollout:
     """One world from the first frame of ``piece`` to its last.
 
     Args:
         env: of one world, whose endings end nothing; its boxes are those of the first states.
         actor: its mean action is taken.
         piece: of the clip.
+        state: ``[nq]`` and ``[nv]`` to begin in; None for the episode's own first state.
     """
     base = env.base_env
     assert isinstance(base, EgoPoseEnv)
@@ -62,6 +65,9 @@ def roll_out(env: TransformedEnv, actor: Controller, piece: Piece) -> ClipRollou
     problem.varies = False
     prepare_for_test(env, actor)
     observation = env.reset()
+    if state is not None:
+        base.place(torch.tensor([0]), *(torch.from_numpy(part[None]) for part in state))
+        observation.update(env.transform(base.observe()))
     qpos, qvel, ctrl = [physics.qpos[0].copy()], [physics.qvel[0].copy()], []
     rewards, touched = [], []
     terms: dict[str, list[float]] = {name: [] for name in problem.reward.names}
@@ -92,6 +98,26 @@ def _touched(problem: ReconstructionProblem, base: EgoPoseEnv) -> NDArray[np.boo
     bodies = problem.touching.bodies.numpy()
     floor, boxes = base.physics.floor_contacts[0, bodies], base.physics.box_contacts[0, bodies]
     return np.concatenate([floor[:, None], boxes], axis=1)
+
+
+def joined(rollouts: Sequence[ClipRollout]) -> ClipRollout:
+    """Rollouts each of which begins in the state that the one before ends in, as one."""
+    first, motions = rollouts[0].first, [one.motion for one in rollouts]
+    later = motions[1:]
+    motion = SimulatedMotion(
+        np.concatenate([motions[0].qpos, *(one.qpos[1:] for one in later)]),
+        np.concatenate([motions[0].qvel, *(one.qvel[1:] for one in later)]),
+        np.concatenate([one.ctrl for one in motions]),
+        motions[0].box_tops,
+        motions[0].box_headings,
+    )
+    ended: dict[str, int | None] = {}
+    for name in rollouts[0].ended:
+        frames = [at + one.first - first for one in rollouts if (at := one.ended[name]) is not None]
+        ended[name] = min(frames, default=None)
+    terms = {name: np.concatenate([one.terms[name] for one in rollouts]) for name in rollouts[0].terms}
+    rewards, touched = (np.concatenate([getattr(one, name) for one in rollouts]) for name in ("rewards", "touched"))
+    return ClipRollout(motion, first, rewards, terms, ended, touched)
 
 
 def after(rollout: ClipRollout, before: SimulatedMotion) -> SimulatedMotion:

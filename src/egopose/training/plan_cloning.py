@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -28,7 +27,7 @@ class PlanCloningSettings:
         rounds: of replays and learning. The first is led by the teacher, later ones by the policy as well.
         bodies: side by side in a round's replays.
         nearby: states near each one met, with the control that the teacher would take there.
-        seconds: of learning, a round.
+        steps: of learning, a round.
         batch: lessons a step.
         learning_rate: Adam's, falling to nothing.
         largest: units of the action; what teacher would exceed is cut.
@@ -38,7 +37,7 @@ class PlanCloningSettings:
     rounds: int
     bodies: int
     nearby: int
-    seconds: float
+    steps: int
     batch: int
     learning_rate: float
     largest: float
@@ -133,10 +132,10 @@ def clone_plan(
     """Teach ``mean(normalised state, scene) -> action``; the root mean squared error of the last steps, units."""
     optimiser = torch.optim.Adam(parameters, lr=settings.learning_rate)
     state = normalizer.normalize(lessons.state)
-    began, errors = time.monotonic(), list[float]()
-    while (share := (time.monotonic() - began) / settings.seconds) < 1.0:
+    errors = list[float]()
+    for step in range(settings.steps):
         for group in optimiser.param_groups:
-            group["lr"] = settings.learning_rate * (1.0 - share)
+            group["lr"] = settings.learning_rate * (1.0 - step / settings.steps)
         rows = torch.randint(len(state), (settings.batch,), generator=generator)
         loss = (mean(state[rows], lessons.scene[rows]) - lessons.action[rows]).square().mean()
         optimiser.zero_grad(set_to_none=True)
