@@ -75,6 +75,9 @@ def test_lessons_are_actions_that_give_the_teachers_control(school: tuple) -> No
     wanted = np.clip(teacher.control(frame, qpos, qvel), low, high)
     np.testing.assert_allclose(lessons_of.target(lessons.action, frame), wanted, atol=1e-6)
     assert lessons.scene.shape == (20, 2)
+    assert (lessons.scene - lessons.scene[0]).abs().max() == 0
     more = lessons_of.lessons(frame, qpos, qvel, cloning, np.random.default_rng(0))
+    assert more.scene[20:].abs().max() > 0.5, "boxes that vary are seen elsewhere"
+    assert more.scene.abs().max() <= 1.0
     assert len(more.state) == 20 * (1 + cloning.nearby)
     torch.testing.assert_close(more.state[:20], lessons.state)

@@ -192,8 +192,10 @@ class ReconstructionProblem(ImitationProblem):
     def first_state(self, frame: Tensor, scene: Scene | None = None) -> tuple[Tensor, Tensor]:
         """The start's; a body that a box carries is moved as the box is."""
         qpos, qvel = self.start.qpos.index_select(0, frame), self.start.qvel.index_select(0, frame)
-        if scene is None:
-            return qpos, qvel
+        return (qpos, qvel) if scene is None else self.carried(frame, qpos, qvel, scene)
+
+    def carried(self, frame: Tensor, qpos: Tensor, qvel: Tensor, scene: Scene) -> tuple[Tensor, Tensor]:
+        """Bodies ``[n]`` at ``frame [n]``, among the boxes of the first states, moved to where ``scene`` has theirs."""
         support = self.start.support.index_select(0, frame)
         rows, at = torch.arange(len(frame)), support.clamp_min(0)
         tops, headings = self.ranges.changed(self.start.change)

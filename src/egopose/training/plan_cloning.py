@@ -71,16 +71,24 @@ class PlanSchool:
         self._placer = Placer(humanoid.mj_model, humanoid.body_ids)
         self._mass = humanoid.mj_model.body_mass[humanoid.body_ids]
 
-    def seen(self, frame: NDArray[np.int64], qpos: Array, qvel: Array) -> tuple[Tensor, Tensor]:
-        """``humanoid_state [n, S]`` and ``scene_parameters [n, P]`` of bodies at ``frame [n]``, float32."""
-        xpos, xquat, xipos = self._placer(qpos)
+    def seen(
+        self, frame: NDArray[np.int64], qpos: Array, qvel: Array, change: Tensor | None = None
+    ) -> tuple[Tensor, Tensor]:
+        """``humanoid_state [n, S]`` and ``scene_parameters [n, P]`` of bodies at ``frame [n]``, float32.
+
+        With ``change [n, K, 4]`` of the boxes each body is moved as the box is that carries it.
+        """
+        problem, at, count = self._problem, torch.from_numpy(frame), len(frame)
+        scene = problem.ranges.scene(problem.start.change.expand(count, -1, -1) if change is None else change)
+        state = torch.from_numpy(qpos), torch.from_numpy(qvel)
+        if change is not None and len(problem.ranges.headings):
+            state = problem.carried(at, *state, scene)
+        places = state[0].numpy()
+        xpos, xquat, xipos = self._placer(places)
         com = self._mass @ xipos / self._mass.sum()
-        arrays = {"qpos": qpos, "qvel": qvel, "xpos": xpos, "xquat": xquat, "com": com}
-        body = BodyView({name: torch.from_numpy(value) for name, value in arrays.items()}, self._problem.layout)
-        plan, count = self._teacher.plan, len(frame)
-        tops, headings = torch.tensor(plan.box_tops), torch.tensor(plan.box_headings)
-        among = body.qpos[:, :7], tops.expand(count, -1, -1), headings.expand(count, -1)
-        seen = self._problem.observations_among(body, torch.from_numpy(frame), *among)
+        arrays = {"qpos": places, "qvel": state[1].numpy(), "xpos": xpos, "xquat": xquat, "com": com}
+        body = BodyView({name: torch.from_numpy(value) for name, value in arrays.items()}, problem.layout)
+        seen = problem.observations_among(body, at, body.qpos[:, :7], scene.top, scene.heading)
         return seen["humanoid_state"].float(), seen["scene_parameters"].float()
 
     def target(self, action: Tensor, frame: NDArray[np.int64]) -> Array:
@@ -95,18 +103,24 @@ class PlanSchool:
         settings: PlanCloningSettings,
         rng: np.random.Generator,
     ) -> PlanLessons:
-        """Of these states, and of ``nearby`` others around each."""
+        """Of these states, and of ``nearby`` others around each.
+
+        Where episodes' boxes vary, the others see boxes drawn from their ranges. What the control should be there
+        nobody knows; that it changes little is a better beginning than what an untaught network makes of it.
+        """
         nv, deviation = qvel.shape[1], self._teacher.settings.deviations(qvel.shape[1])
         parts = [(frame, qpos, qvel)]
         for _ in range(settings.nearby):
             move = deviation * rng.normal(size=(len(frame), 2 * nv)) * rng.random((len(frame), 1))
             parts.append((frame, moved(qpos, move[:, :nv]), qvel + move[:, nv:]))
+        varies, generator = self._problem.varies, torch.Generator().manual_seed(int(rng.integers(2**31)))
         out = None
         for at, places, speeds in parts:
             ctrl = torch.from_numpy(self._teacher.control(at, places, speeds))
             base = self._problem.target(torch.zeros(ctrl.shape), torch.from_numpy(at + 1))
             action = (ctrl - base) / self._problem.action.scale
-            state, scene = self.seen(at, places, speeds)
+            change = self._problem.ranges.drawn(len(at), generator) if varies and parts[0][1] is not places else None
+            state, scene = self.seen(at, places, speeds, change)
             part = PlanLessons(state, scene, action.clamp(-settings.largest, settings.largest).float())
             out = part if out is None else out + part
         assert out is not None
