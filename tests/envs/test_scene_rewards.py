@@ -75,6 +75,7 @@ def hints(**told: Any) -> ClipHints:
         "landing_on": torch.tensor([0]),
         "landing_reach": f64(0.0),
         "com_height": f64(1.0),
+        "trust": f64(1.0),
         "box_sizes": torch.ones(boxes, 2, dtype=torch.float64),
     }
     return ClipHints(**{**usual, **told})
@@ -111,6 +112,8 @@ def test_pose_and_velocity_are_of_the_joints_alone() -> None:
     assert float(scene_rewards.clip_pose(view(bent), scale=12.0, norm="sum")) == pytest.approx(math.exp(-12 * 0.1))
     assert float(scene_rewards.clip_pose(view(bent), scale=12.0, norm="mean")) == pytest.approx(math.exp(-12 * 0.05))
     assert float(scene_rewards.clip_velocity(view(bent), scale=0.6, norm="mean")) == pytest.approx(math.exp(-0.6 * 5))
+    unsure = view(bent, hints(trust=f64(0.25)))
+    assert float(scene_rewards.clip_pose(unsure, scale=12.0, norm="mean")) == pytest.approx(0.25 * math.exp(-0.6))
     turned = body(angles=f64(0.3, -0.1), root=(0.0, 1.0, 0.0, 0.0), com=(5.0, 0.0, 3.0))
     for name, norm in (("clip_pose", "mean"), ("clip_velocity", "sum")):
         term = getattr(scene_rewards, name)
@@ -232,9 +235,8 @@ def test_landings_of_a_clip() -> None:
     points = torch.zeros(6, 4, 3, dtype=torch.float64)
     points[3, 3] = f64(0.0, 0.3, 0.6)
     com = f64(0.0, 0.0, 1.0).expand(6, 3)
-    told = hints_of(
-        torch.zeros(6).double(), clip, points, com, torch.full((6,), 0.1).double(), torch.ones(1, 2).double()
-    )
+    lowest, sizes = torch.full((6,), 0.1).double(), torch.ones(1, 2).double()
+    told = hints_of(torch.zeros(6).double(), clip, points, com, lowest, torch.ones(6).double(), sizes)
     assert told.landing_reach[1:3].tolist() == pytest.approx([0.5, 0.5])
     assert told.com_height.tolist() == pytest.approx([0.9] * 6)
     assert told.at(torch.tensor([2, 0])).landing_after.tolist() == [1, 0]

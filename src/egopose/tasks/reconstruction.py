@@ -215,7 +215,9 @@ def clip_hints(
     name = humanoid.skeleton.names[humanoid.head]
     up = torch.from_numpy(up_hint(clip.body, name))
     sizes = torch.from_numpy(humanoid.box_sizes)
-    return hints_of(up, touches, places, reference["com"].double(), xpos[..., 2].amin(-1), sizes)
+    sure = clip.body.confidence
+    trust = torch.ones(len(clip), dtype=torch.float64) if sure is None else torch.tensor(sure, dtype=torch.float64)
+    return hints_of(up, touches, places, reference["com"].double(), xpos[..., 2].amin(-1), trust, sizes)
 
 
 def _plan(path: Path, clip: Clip, humanoid: HumanoidModel) -> SimulatedMotion:

@@ -27,6 +27,7 @@ class ClipHints:
         landing_on: ``[T]`` int64 on what: 0 the floor, k + 1 box k.
         landing_reach: ``[T]`` m from the centre of mass to that effector in the pose of the landing.
         com_height: ``[T]`` m, the centre of mass over the lowest joint of the pose.
+        trust: ``[T]`` how sure the poses are, 1 as sure as usual: the paper's keyframes by hand have 0.1 of 0.35.
         box_sizes: ``[K, 2]`` m, lengths and widths of the boxes' upper faces.
     """
 
@@ -37,6 +38,7 @@ class ClipHints:
     landing_on: Tensor
     landing_reach: Tensor
     com_height: Tensor
+    trust: Tensor
     box_sizes: Tensor
 
     def at(self, frame: Tensor) -> ClipHints:
@@ -60,11 +62,13 @@ def landings(touches: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     return after, effector, on
 
 
-def hints_of(up: Tensor, touches: Tensor, points: Tensor, com: Tensor, lowest: Tensor, box_sizes: Tensor) -> ClipHints:
+def hints_of(
+    up: Tensor, touches: Tensor, points: Tensor, com: Tensor, lowest: Tensor, trust: Tensor, box_sizes: Tensor
+) -> ClipHints:
     """The hints of a clip.
 
     Args:
-        up, touches, box_sizes: see :class:`ClipHints`.
+        up, touches, trust, box_sizes: see :class:`ClipHints`.
         points: ``[T, 4, 3]`` m, the effectors' in the poses, wherever the root is.
         com: ``[T, 3]`` m, the centre of mass beside them.
         lowest: ``[T]`` m, height of the lowest joint beside them.
@@ -72,4 +76,4 @@ def hints_of(up: Tensor, touches: Tensor, points: Tensor, com: Tensor, lowest: T
     after, effector, on = landings(touches)
     landing = torch.arange(len(touches)) + after
     reach = (com[landing] - points[landing, effector]).norm(dim=-1)
-    return ClipHints(up, touches, after, effector, on, reach, com[:, 2] - lowest, box_sizes)
+    return ClipHints(up, touches, after, effector, on, reach, com[:, 2] - lowest, trust, box_sizes)

@@ -33,8 +33,9 @@ def _squared(values: Tensor, norm: str) -> Tensor:
 
 @reward_term(reads=("joint_angles",))
 def clip_pose(view: StepView, *, scale: float, norm: str) -> Tensor:
-    """r_q = exp(-scale |q^ - q|^2) of the joints' angles ``[N]`` (equation 6, scale 12)."""
-    return torch.exp(-scale * _squared(view.body.joint_angles - view.reference.joint_angles, norm))
+    """r_q = exp(-scale |q^ - q|^2) of the joints' angles ``[N]``, times the pose's trust (equation 6, scale 12)."""
+    away = _squared(view.body.joint_angles - view.reference.joint_angles, norm)
+    return _hints(view).trust * torch.exp(-scale * away)
 
 
 @reward_term(reads=("joint_velocities",))
