@@ -84,6 +84,21 @@ def test_a_body_that_a_box_carries_begins_where_the_box_is(folder: Path) -> None
     env.close()
 
 
+def test_a_body_does_not_begin_in_a_box(folder: Path) -> None:
+    """On its way to a step that is raised by 0.2 m under its foot."""
+    env = environment(folder)
+    problem = problem_of(env)
+    place = problem.start.qpos[6, :2]
+    boxes = len(problem.ranges.headings)
+    top = torch.cat([place, torch.tensor([0.12], dtype=torch.float64)]).expand(1, boxes, 3)
+    scene = Scene(top, torch.zeros(1, boxes).double(), torch.ones(1, boxes, dtype=torch.bool))
+    moved, _ = problem.first_state(torch.tensor([6]), scene)
+    plain, _ = problem.first_state(torch.tensor([6]))
+    assert 0.05 < float(moved[0, 2] - plain[0, 2]) < 0.15
+    torch.testing.assert_close(moved[0, :2], plain[0, :2])
+    env.close()
+
+
 def test_nothing_of_the_clips_root_reaches_policy_or_reward(folder: Path, tmp_path: Path) -> None:
     """The same poses elsewhere, turned about the vertical: the same state sees and earns the same."""
     from egopose.motion import rotations as rot

@@ -9,7 +9,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from egopose.envs.scene_ranges import SceneRanges, moved_with
+from egopose.envs.scene_ranges import SceneRanges, depth_in_scene, moved_with
 
 
 def ranges() -> SceneRanges:
@@ -63,3 +63,20 @@ def test_a_body_keeps_its_place_on_the_box() -> None:
     expected = torch.tensor([[3.0, 2.2, 1.4, half, 0.0, 0.0, half, 0.7]], dtype=torch.float64)
     torch.testing.assert_close(places, expected)
     torch.testing.assert_close(speeds, torch.tensor([[0.0, 1.0, 0.5, 0.1, 0.2, 0.3, 4.0]], dtype=torch.float64))
+
+
+def test_how_far_a_body_must_be_raised() -> None:
+    """A box of 0.4 x 1 m, turned by 90 degrees, its face at (1, 2, 0.5)."""
+    tops = torch.tensor([[[1.0, 2.0, 0.5]]], dtype=torch.float64).expand(6, 1, 3)
+    headings = torch.full((6, 1), math.pi / 2, dtype=torch.float64)
+    sizes = torch.tensor([[0.4, 1.0]], dtype=torch.float64)
+    points = [
+        (1.4, 2.1, 0.3),  # 0.2 under the face: 0.4 across, 0.1 along
+        (1.4, 2.3, 0.3),  # 0.3 along: beside it
+        (1.0, 2.0, 0.7),  # above
+        (3.0, 0.0, -0.1),  # in the floor
+        (1.0, 2.0, -0.05),  # nearly too deep to have come from above
+        (1.4, 2.1, 0.45),
+    ]
+    depth = depth_in_scene(torch.tensor(points, dtype=torch.float64)[:, None], tops, headings, sizes)
+    assert depth.tolist() == pytest.approx([0.2, 0.0, 0.0, 0.1, 0.55, 0.05])

@@ -23,10 +23,13 @@ from egopose.envs.mdp.rotations import yaw
 from egopose.envs.mdp.scene_rewards import contact_mismatch
 from egopose.envs.mdp.step_view import StepView
 from egopose.envs.problem import Scene, TakeTable
-from egopose.envs.scene_ranges import SceneRanges, moved_with
+from egopose.envs.scene_ranges import SceneRanges, depth_in_scene, moved_with
 from egopose.humanoid.link_rates import LinkRates
 from egopose.humanoid.model import HumanoidModel
+from egopose.humanoid.physics_worker import Placer
 
+#: m: so deep a kinematic foot may be in what it stands on; physics pushes it out gently.
+_SUNK = 0.03
 ENDINGS = ("centre_of_mass_low", "up_hint_off", "contact_mismatch", "forbidden_contact")
 
 
@@ -117,6 +120,7 @@ class ReconstructionProblem(ImitationProblem):
         }
         self.watched = reward.needs | {"contacts"}
         self.memory_size = len(touching.bodies) + 1
+        self._placer = Placer(humanoid.mj_model, humanoid.body_ids)
         self._torque_limit = torch.as_tensor(humanoid.torque_limit, dtype=torch.float64)
         self._others = torch.ones(bodies, dtype=torch.bool)
         self._others[touching.bodies] = False
@@ -190,9 +194,22 @@ class ReconstructionProblem(ImitationProblem):
         return self.ranges.scene(self.start.change.expand(count, -1, -1))
 
     def first_state(self, frame: Tensor, scene: Scene | None = None) -> tuple[Tensor, Tensor]:
-        """The start's; a body that a box carries is moved as the box is."""
+        """The start's; a body that a box carries is moved as the box is, and one that would be in a box is raised."""
         qpos, qvel = self.start.qpos.index_select(0, frame), self.start.qvel.index_select(0, frame)
-        return (qpos, qvel) if scene is None else self.carried(frame, qpos, qvel, scene)
+        if scene is None:
+            return qpos, qvel
+        qpos, qvel = self.carried(frame, qpos, qvel, scene)
+        up = torch.zeros_like(qpos)
+        up[:, 2] = (self._depth(qpos.detach(), scene) - _SUNK).clamp_min(0.0)
+        return qpos + up, qvel
+
+    def _depth(self, qpos: Tensor, scene: Scene) -> Tensor:
+        """``[n]`` m, how deep bodies are in the scene, by their joints, soles and hands."""
+        xpos, xquat, _ = self._placer(qpos.numpy())
+        state = {"qpos": qpos, "qvel": qpos, "xpos": torch.from_numpy(xpos), "xquat": torch.from_numpy(xquat)}
+        body = BodyView(state, self.layout)
+        points = torch.cat([body.xpos, body.touching_points], dim=1)
+        return depth_in_scene(points, scene.top.detach(), scene.heading.detach(), self.hints.box_sizes)
 
     def carried(self, frame: Tensor, qpos: Tensor, qvel: Tensor, scene: Scene) -> tuple[Tensor, Tensor]:
         """Bodies ``[n]`` at ``frame [n]``, among the boxes of the first states, moved to where ``scene`` has theirs."""

@@ -15,6 +15,8 @@ from torch import Tensor
 from egopose.envs.mdp.rotations import wrapped
 from egopose.envs.problem import Scene
 
+#: m: what is deeper under an upper face came from the side.
+_DEEPEST = 0.6
 #: m: no upper face is lower, for a box must reach above the floor to be one.
 _LOWEST = 0.0
 
@@ -110,3 +112,18 @@ def moved_with(
     quaternion = torch.stack([c * w - s * z, c * x - s * y, c * y + s * x, c * z + s * w], dim=-1)
     moved = torch.cat([level, height[:, None], quaternion, qpos[:, 7:]], dim=-1)
     return moved, torch.cat([turned(qvel[:, :2]), qvel[:, 2:]], dim=-1)
+
+
+def depth_in_scene(points: Tensor, tops: Tensor, headings: Tensor, sizes: Tensor) -> Tensor:
+    """``[n]`` m: how far bodies must be raised so that none of their points is in a box or the floor.
+
+    Args:
+        points: ``[n, P, 3]`` m.
+        tops: ``[n, K, 3]`` m. headings: ``[n, K]`` rad. sizes: ``[K, 2]`` m, of the upper faces.
+    """
+    away = points[:, :, None] - tops[:, None]
+    cos, sin = headings.cos()[:, None], headings.sin()[:, None]
+    along, across = cos * away[..., 0] + sin * away[..., 1], cos * away[..., 1] - sin * away[..., 0]
+    over = (along.abs() < 0.5 * sizes[:, 0]) & (across.abs() < 0.5 * sizes[:, 1])
+    depth = torch.where(over & (away[..., 2] > -_DEEPEST), -away[..., 2], 0.0)
+    return torch.cat([depth.flatten(1), -points[..., 2]], dim=-1).amax(-1).clamp_min(0.0)
