@@ -1,0 +1,256 @@
+"""What acts on a simulated body: its controls are played again, and MuJoCo's own forces are kept step by step.
+
+Nothing is estimated here. Every control step starts from the saved state with a cold constraint solver, as in
+:class:`egopose.humanoid.physics.BatchedPhysics`, and has to end in the next saved state.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from egopose.humanoid.boxes import Boxes
+from egopose.humanoid.model import HumanoidModel
+from egopose.motion.ground_reaction import GroundReaction
+from egopose.motion.motion import Motion
+from egopose.motion.rotations import Array
+
+#: rad, m and their rates: a replay that ends further off was made with another body, other boxes or other physics.
+#: On one machine it is exact; another machine rounds otherwise, and each control step starts anew.
+_TOLERANCE = 1e-5
+
+
+@dataclass(frozen=True, eq=False)
+class ReplayedForces:
+    """Forces of every step of physics, ``N = (T - 1) substeps`` of them; row n holds from time ``n / rate`` on.
+
+    Bodies are the skeleton's, in its order. Surfaces are the floor, then the K boxes. World axes, z up.
+
+    Args:
+        rate: steps of physics a second.
+        substeps: steps of physics in a control step.
+        mass: kg, of the body.
+        gravity: m/s^2, positive.
+        qpos: ``[N, nq]`` at the beginning of each step.
+        places: ``[N, B, 3]`` m, the bodies' joints.
+        com, com_velocity: ``[N, 3]`` m and m/s, centre of mass.
+        force: ``[N, B, 1 + K, 3]`` N on each body from each surface.
+        moment: ``[N, B, 1 + K, 3]`` N m of these forces about the world's origin.
+        normal: ``[N, B, 1 + K]`` N, sum of the contacts' normal forces.
+        pressure: ``[N, B, 1 + K, 3]`` N m: contact points times their normal forces, summed. Over ``normal`` it is the
+            centre of pressure, on a box's side as on the floor.
+        depth: ``[N, B, 1 + K]`` m that the body reaches into the surface; NaN where it does not touch it.
+        torques: ``[N, nu]`` N m that the joints exert on the limbs. Stable PD (Tan et al. 2011, eqs. 9-11) counts the
+            share of the armature that belongs to it as part of the controller; limits of joints are not in it.
+        speeds: ``[N, nu]`` rad/s of the joints.
+        drift: the largest difference between a replayed and a saved state.
+    """
+
+    rate: float
+    substeps: int
+    mass: float
+    gravity: float
+    qpos: Array
+    places: Array
+    com: Array
+    com_velocity: Array
+    force: Array
+    moment: Array
+    normal: Array
+    pressure: Array
+    depth: Array
+    torques: Array
+    speeds: Array
+    drift: float
+
+    def __len__(self) -> int:
+        return len(self.com)
+
+    @property
+    def frames(self) -> int:
+        """T, states of the simulated motion."""
+        return len(self) // self.substeps + 1
+
+    @property
+    def weight(self) -> float:
+        """N."""
+        return self.mass * self.gravity
+
+    @property
+    def touching(self) -> NDArray[np.bool_]:
+        """``[N, B, 1 + K]`` which bodies touch which surfaces."""
+        return np.isfinite(self.depth)
+
+    @property
+    def power(self) -> Array:
+        """``[N, nu]`` W, mechanical power of the joints: positive where they drive."""
+        return self.torques * self.speeds
+
+    @property
+    def centre_of_pressure(self) -> Array:
+        """``[N, B, 1 + K, 3]`` m; NaN where a surface does not push."""
+        pushed = self.normal > 0
+        return np.where(pushed[..., None], self.pressure / np.where(pushed, self.normal, 1.0)[..., None], np.nan)
+
+    def per_frame(self, values: Array) -> Array:
+        """``[T, ...]``: the mean of ``values [N, ...]`` over a control step's time around each frame.
+
+        The first and the last frame have half of it.
+        """
+        ends = (window(t, self.substeps, len(self)) for t in range(self.frames))
+        return np.stack([values[part].mean(axis=0) for part in ends])
+
+    def any_at_frame(self, flags: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """``[T, ...]``: whether one of ``flags [N, ...]`` is set in a control step's time around each frame."""
+        ends = (window(t, self.substeps, len(self)) for t in range(self.frames))
+        return np.stack([flags[part].any(axis=0) for part in ends])
+
+
+def window(frame: int, substeps: int, count: int) -> slice:
+    """The steps of physics, of ``count``, that lie within half a control step of a frame."""
+    first, last = frame * substeps - substeps // 2, frame * substeps + (substeps + 1) // 2
+    first = min(max(first, 0), count - 1)
+    return slice(first, max(min(last, count), first + 1))
+
+
+def replay_forces(
+    humanoid: HumanoidModel, qpos: Array, qvel: Array, ctrl: Array, box_tops: Array, box_headings: Array
+) -> ReplayedForces:
+    """Play the controls again and keep what acts on the body.
+
+    Args:
+        humanoid: in a world with K boxes (:func:`egopose.humanoid.boxes.with_boxes`), at the simulation's rate.
+        qpos, qvel: ``[T, nq]`` and ``[T, nv]``, the states at the control rate; at least two.
+        ctrl: ``[T - 1, nu]`` rad, PD targets held from a frame to the next.
+        box_tops: ``[K, 3]`` m, centres of the upper faces.
+        box_headings: ``[K]`` rad.
+
+    Raises:
+        ValueError: shapes that do not fit the humanoid, a box that cannot be there, or a control step that does not
+            end in the next state.
+    """
+    model = humanoid.mj_model
+    _check(humanoid, qpos, qvel, ctrl)
+    boxes = Boxes(model)
+    positions, quaternions = boxes.poses(box_tops[None], box_headings[None])
+    data = mujoco.MjData(model)
+    order = model.body_mocapid[boxes.bodies]
+    if len(boxes):
+        data.mocap_pos[order], data.mocap_quat[order] = positions[0], quaternions[0]
+    keep = _Recorder(humanoid, (len(qpos) - 1) * humanoid.substeps)
+    drift = 0.0
+    for t in range(len(qpos) - 1):
+        data.qpos[:], data.qvel[:], data.ctrl[:] = qpos[t], qvel[t], ctrl[t]
+        data.qacc_warmstart[:] = 0.0
+        for _ in range(humanoid.substeps):
+            keep.before(data)
+            mujoco.mj_step(model, data)
+            keep.after(data)
+        off = max(np.abs(data.qpos - qpos[t + 1]).max(), np.abs(data.qvel - qvel[t + 1]).max())
+        if not off <= _TOLERANCE:
+            cause = "made with another body, other boxes or another rate of physics"
+            raise ValueError(f"the controls of frame {t} do not lead to frame {t + 1}: {off:.3g} off; {cause}")
+        drift = max(drift, float(off))
+    return keep.done(drift)
+
+
+def with_replayed_forces(motion: Motion, humanoid: HumanoidModel, forces: ReplayedForces) -> Motion:
+    """The simulated motion with ``torques``, ``ground_reaction`` and ``contacts`` of feet and of all that was pushed.
+
+    Each frame has the mean over a control step's time around it. ``meta["forces"]`` says so.
+
+    Args:
+        motion: ``[T]`` the simulated states as a motion.
+        humanoid: that was simulated.
+        forces: of its replay.
+    """
+    touching = forces.any_at_frame(forces.touching.any(axis=2))
+    kept = np.union1d(humanoid.feet, np.flatnonzero(touching.any(axis=0)))
+    summed = {name: getattr(forces, name)[:, kept].sum(axis=2) for name in ("force", "moment", "normal", "pressure")}
+    mean = {name: forces.per_frame(values) for name, values in summed.items()}
+    pushed = mean["normal"] > 0
+    own = motion.forward_kinematics()[0][:, kept] * [1.0, 1.0, 0.0]
+    centre = mean["pressure"] / np.where(pushed, mean["normal"], 1.0)[..., None]
+    point = np.where(pushed[..., None], centre, own)
+    names = tuple(humanoid.skeleton.names[body] for body in kept)
+    moment = np.where(pushed[..., None], mean["moment"] - np.cross(point, mean["force"]), 0.0)
+    return replace(
+        motion,
+        torques=forces.per_frame(forces.torques),
+        ground_reaction=GroundReaction(names, mean["force"], point, moment),
+        contacts=touching[:, kept],
+        contact_names=names,
+        meta={**motion.meta, "forces": {"method": "simulation", "physics_hz": forces.rate, "drift": forces.drift}},
+    )
+
+
+def _check(humanoid: HumanoidModel, qpos: Array, qvel: Array, ctrl: Array) -> None:
+    model, frames = humanoid.mj_model, len(qpos)
+    wanted = {"qpos": (frames, model.nq), "qvel": (frames, model.nv), "ctrl": (frames - 1, model.nu)}
+    for (name, shape), array in zip(wanted.items(), (qpos, qvel, ctrl), strict=True):
+        if array.shape != shape or frames < 2:
+            raise ValueError(f"{name} is {list(array.shape)}; {list(shape)} fits this body, with at least two frames")
+
+
+class _Recorder:
+    """Arrays of :class:`ReplayedForces`, filled as physics goes on."""
+
+    def __init__(self, humanoid: HumanoidModel, count: int) -> None:
+        model = self._model = humanoid.mj_model
+        bodies, surfaces = len(humanoid.body_ids), 1 + model.nmocap
+        self._humanoid, self._row = humanoid, 0
+        self._body = np.full(model.nbody, -1)
+        self._body[humanoid.body_ids] = np.arange(bodies)
+        self._dofs = model.jnt_dofadr[model.actuator_trnid[:, 0]]
+        self._inertia = humanoid.kd * model.opt.timestep
+        self._wrench = np.zeros(6)
+        shapes: dict[str, tuple[int, ...]] = {"qpos": (model.nq,), "places": (bodies, 3), "com": (3,)}
+        shapes |= {"com_velocity": (3,), "torques": (model.nu,), "speeds": (model.nu,)}
+        shapes |= {name: (bodies, surfaces, 3) for name in ("force", "moment", "pressure")}
+        shapes |= {name: (bodies, surfaces) for name in ("normal", "depth")}
+        self._kept = {name: np.zeros((count, *shape)) for name, shape in shapes.items()}
+        self._kept["depth"][:] = np.nan
+
+    def before(self, data: mujoco.MjData) -> None:
+        row = {name: values[self._row] for name, values in self._kept.items()}
+        row["qpos"][:], row["speeds"][:] = data.qpos, data.qvel[self._dofs]
+
+    def after(self, data: mujoco.MjData) -> None:
+        """Positions and forces in ``data`` are those of the step's beginning."""
+        row = {name: values[self._row] for name, values in self._kept.items()}
+        root = int(self._humanoid.body_ids[0])
+        mujoco.mj_subtreeVel(self._model, data)
+        row["places"][:] = data.xpos[self._humanoid.body_ids]
+        row["com"][:], row["com_velocity"][:] = data.subtree_com[root], data.subtree_linvel[root]
+        row["torques"][:] = data.qfrc_actuator[self._dofs] - self._inertia * data.qacc[self._dofs]
+        for number, contact in enumerate(data.contact[: data.ncon]):
+            self._contact(data, number, contact, row)
+        self._row += 1
+
+    def _contact(self, data: mujoco.MjData, number: int, contact: mujoco.MjContact, row: dict[str, Array]) -> None:
+        first, second = (int(self._model.geom_bodyid[geom]) for geom in contact.geom)
+        # MuJoCo's force acts on the second geom's body.
+        body, other, sign = (second, first, 1.0) if self._body[second] >= 0 else (first, second, -1.0)
+        at = int(self._body[body]), 1 + int(self._model.body_mocapid[other])
+        mujoco.mj_contactForce(self._model, data, number, self._wrench)
+        frame = contact.frame.reshape(3, 3)
+        force, turning = sign * self._wrench[:3] @ frame, sign * self._wrench[3:] @ frame
+        row["force"][at] += force
+        row["moment"][at] += np.cross(contact.pos, force) + turning
+        row["normal"][at] += self._wrench[0]
+        row["pressure"][at] += self._wrench[0] * contact.pos
+        row["depth"][at] = np.fmax(row["depth"][at], -contact.dist)
+
+    def done(self, drift: float) -> ReplayedForces:
+        model, humanoid = self._model, self._humanoid
+        return ReplayedForces(
+            rate=1.0 / model.opt.timestep,
+            substeps=humanoid.substeps,
+            mass=float(model.body_mass[humanoid.body_ids].sum()),
+            gravity=-float(model.opt.gravity[2]),
+            drift=drift,
+            **self._kept,
+        )
