@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -197,7 +198,7 @@ def steps(contacts: Sequence[FootContact], feet: Array, com: Array, air: Sequenc
     """
     out = []
     strikes = [contact for contact in contacts if contact.begin > 0]
-    for first, second in zip(strikes, strikes[1:], strict=False):
+    for first, second in pairwise(strikes):
         time = (second.begin - first.begin) / rate
         way = com[second.begin, :2] - com[first.begin, :2]
         far = float(np.linalg.norm(way))
