@@ -209,8 +209,8 @@ class _Recorder:
         self._wrench = np.zeros(6)
         shapes: dict[str, tuple[int, ...]] = {"qpos": (model.nq,), "places": (bodies, 3), "com": (3,)}
         shapes |= {"com_velocity": (3,), "torques": (model.nu,), "speeds": (model.nu,)}
-        shapes |= {name: (bodies, surfaces, 3) for name in ("force", "moment", "pressure")}
-        shapes |= {name: (bodies, surfaces) for name in ("normal", "depth")}
+        shapes |= dict.fromkeys(("force", "moment", "pressure"), (bodies, surfaces, 3))
+        shapes |= dict.fromkeys(("normal", "depth"), (bodies, surfaces))
         self._kept = {name: np.zeros((count, *shape)) for name, shape in shapes.items()}
         self._kept["depth"][:] = np.nan
 

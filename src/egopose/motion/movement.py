@@ -187,7 +187,7 @@ def foot_contacts(touching: NDArray[np.bool_], vertical: Array, rate: float) -> 
 
 
 def steps(contacts: Sequence[FootContact], feet: Array, com: Array, air: Sequence[Flight], rate: float) -> list[Step]:
-    """Strikes of one foot after strikes of the other, with the body on its way.
+    """Strikes of one foot after strikes of the other, with the body on its way; landings on both feet are none.
 
     Args:
         contacts: of :func:`foot_contacts`; those that the clip's beginning cuts have no strike.
@@ -197,7 +197,10 @@ def steps(contacts: Sequence[FootContact], feet: Array, com: Array, air: Sequenc
         rate: samples a second.
     """
     out = []
-    strikes = [contact for contact in contacts if contact.begin > 0]
+    both = {
+        a.begin for a in contacts for b in contacts if a.side != b.side and abs(a.begin - b.begin) < SHORTEST * rate
+    }
+    strikes = [contact for contact in contacts if contact.begin > 0 and contact.begin not in both]
     for first, second in pairwise(strikes):
         time = (second.begin - first.begin) / rate
         way = com[second.begin, :2] - com[first.begin, :2]

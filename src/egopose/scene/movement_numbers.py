@@ -13,6 +13,7 @@ from pathlib import Path
 
 import mujoco
 import numpy as np
+from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter1d
 
 from egopose.core.result_files import csv_cell
@@ -235,12 +236,12 @@ def write_numbers_csv(rows: Sequence[Row], path: Path) -> None:
             writer.writerow([row.what, row.side, csv_cell(row.value), row.unit, *(csv_cell(f) for f in row.frames)])
 
 
-def _support_height(touching: np.ndarray, box_tops: Array) -> Array:
+def _support_height(touching: NDArray[np.bool_], box_tops: Array) -> Array:
     """``[N]`` m: the highest surface that is touched, held while nothing is."""
     heights = np.concatenate([[0.0], box_tops[:, 2]])
-    touched = touching.any(axis=1)
+    touched: NDArray[np.bool_] = touching.any(axis=1)
     highest = np.where(touched, heights, -np.inf).max(axis=1)
-    known = np.maximum.accumulate(np.where(touched.any(axis=1), np.arange(len(touched)), 0))
+    known = np.maximum.accumulate(np.where(touched.any(axis=1), np.arange(len(touching)), 0))
     out = highest[known]
     return np.where(np.isfinite(out), out, 0.0)
 
