@@ -57,7 +57,7 @@ def test_a_folder_or_its_plan_is_known(folder: Path, tmp_path: Path) -> None:
 def test_what_does_not_fit_is_told(tmp_path: Path) -> None:
     write_folder(tmp_path, jumping(), scene_at(0.3))
     write_scene(replace(scene_at(0.3), boxes=(STEP,)), tmp_path / "scene.yaml")
-    with pytest.raises(InputError, match="scene.yaml has 1") as caught:
+    with pytest.raises(InputError, match=r"scene\.yaml has 1") as caught:
         read_reconstruction(tmp_path, bare())
     assert caught.value.field == "box_tops"
     motion = jumping()

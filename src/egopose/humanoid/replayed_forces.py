@@ -12,8 +12,8 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from egopose.humanoid.boxes import Boxes
 from egopose.humanoid.model import HumanoidModel
+from egopose.humanoid.surface_contacts import Met, Surfaces
 from egopose.motion.ground_reaction import GroundReaction
 from egopose.motion.motion import Motion
 from egopose.motion.rotations import Array
@@ -134,13 +134,9 @@ def replay_forces(
     """
     model = humanoid.mj_model
     _check(humanoid, qpos, qvel, ctrl)
-    boxes = Boxes(model)
-    positions, quaternions = boxes.poses(box_tops[None], box_headings[None])
-    data = mujoco.MjData(model)
-    order = model.body_mocapid[boxes.bodies]
-    if len(boxes):
-        data.mocap_pos[order], data.mocap_quat[order] = positions[0], quaternions[0]
-    keep = _Recorder(humanoid, (len(qpos) - 1) * humanoid.substeps)
+    surfaces, data = Surfaces(humanoid), mujoco.MjData(model)
+    surfaces.place(data, box_tops, box_headings)
+    keep = _Recorder(humanoid, surfaces, (len(qpos) - 1) * humanoid.substeps)
     drift = 0.0
     for t in range(len(qpos) - 1):
         data.qpos[:], data.qvel[:], data.ctrl[:] = qpos[t], qvel[t], ctrl[t]
@@ -198,19 +194,16 @@ def _check(humanoid: HumanoidModel, qpos: Array, qvel: Array, ctrl: Array) -> No
 class _Recorder:
     """Arrays of :class:`ReplayedForces`, filled as physics goes on."""
 
-    def __init__(self, humanoid: HumanoidModel, count: int) -> None:
+    def __init__(self, humanoid: HumanoidModel, surfaces: Surfaces, count: int) -> None:
         model = self._model = humanoid.mj_model
-        bodies, surfaces = len(humanoid.body_ids), 1 + model.nmocap
-        self._humanoid, self._row = humanoid, 0
-        self._body = np.full(model.nbody, -1)
-        self._body[humanoid.body_ids] = np.arange(bodies)
+        self._humanoid, self._surfaces, self._row = humanoid, surfaces, 0
         self._dofs = model.jnt_dofadr[model.actuator_trnid[:, 0]]
         self._inertia = humanoid.kd * model.opt.timestep
         self._wrench = np.zeros(6)
-        shapes: dict[str, tuple[int, ...]] = {"qpos": (model.nq,), "places": (bodies, 3), "com": (3,)}
+        shapes: dict[str, tuple[int, ...]] = {"qpos": (model.nq,), "places": (surfaces.shape[0], 3), "com": (3,)}
         shapes |= {"com_velocity": (3,), "torques": (model.nu,), "speeds": (model.nu,)}
-        shapes |= dict.fromkeys(("force", "moment", "pressure"), (bodies, surfaces, 3))
-        shapes |= dict.fromkeys(("normal", "depth"), (bodies, surfaces))
+        shapes |= dict.fromkeys(("force", "moment", "pressure"), (*surfaces.shape, 3))
+        shapes |= dict.fromkeys(("normal", "depth"), surfaces.shape)
         self._kept = {name: np.zeros((count, *shape)) for name, shape in shapes.items()}
         self._kept["depth"][:] = np.nan
 
@@ -226,23 +219,19 @@ class _Recorder:
         row["places"][:] = data.xpos[self._humanoid.body_ids]
         row["com"][:], row["com_velocity"][:] = data.subtree_com[root], data.subtree_linvel[root]
         row["torques"][:] = data.qfrc_actuator[self._dofs] - self._inertia * data.qacc[self._dofs]
-        for number, contact in enumerate(data.contact[: data.ncon]):
-            self._contact(data, number, contact, row)
+        for met in self._surfaces.met(data):
+            self._add(data, met, row)
         self._row += 1
 
-    def _contact(self, data: mujoco.MjData, number: int, contact: mujoco.MjContact, row: dict[str, Array]) -> None:
-        first, second = (int(self._model.geom_bodyid[geom]) for geom in contact.geom)
-        # MuJoCo's force acts on the second geom's body.
-        body, other, sign = (second, first, 1.0) if self._body[second] >= 0 else (first, second, -1.0)
-        at = int(self._body[body]), 1 + int(self._model.body_mocapid[other])
-        mujoco.mj_contactForce(self._model, data, number, self._wrench)
-        frame = contact.frame.reshape(3, 3)
-        force, turning = sign * self._wrench[:3] @ frame, sign * self._wrench[3:] @ frame
+    def _add(self, data: mujoco.MjData, met: Met, row: dict[str, Array]) -> None:
+        at = met.body, met.surface
+        mujoco.mj_contactForce(self._model, data, met.number, self._wrench)
+        force, turning = met.sign * self._wrench[:3] @ met.axes, met.sign * self._wrench[3:] @ met.axes
         row["force"][at] += force
-        row["moment"][at] += np.cross(contact.pos, force) + turning
+        row["moment"][at] += np.cross(met.place, force) + turning
         row["normal"][at] += self._wrench[0]
-        row["pressure"][at] += self._wrench[0] * contact.pos
-        row["depth"][at] = np.fmax(row["depth"][at], -contact.dist)
+        row["pressure"][at] += self._wrench[0] * met.place
+        row["depth"][at] = np.fmax(row["depth"][at], met.depth)
 
     def done(self, drift: float) -> ReplayedForces:
         model, humanoid = self._model, self._humanoid
