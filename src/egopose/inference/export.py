@@ -20,7 +20,13 @@ from egopose.core.safe_io import read_json
 from egopose.data.preparation import humanoid_of
 from egopose.humanoid.inverse_dynamics import ForceSettings, with_forces
 from egopose.humanoid.model import HumanoidModel
-from egopose.inference.reconstruction import PLAN, Reconstruction, read_reconstruction, reconstruction_folder
+from egopose.inference.reconstruction import (
+    PLAN,
+    Reconstruction,
+    read_reconstruction,
+    reconstruction_folder,
+    simulated_humanoid,
+)
 from egopose.motion.io import WRITERS, given_options, read_motion, write_motion, writer_suffix
 from egopose.motion.motion import Motion
 from egopose.motion.notes import tell_notes
@@ -54,7 +60,9 @@ def run_export(source: Path, files: Sequence[str], config: Mapping[str, Any]) ->
         raise InputError("export", "to", f"says no file; endings are {', '.join([*WRITERS, NUMBERS])}")
     _check_part(str(config["part"]))
     folder = reconstruction_folder(source)
-    found = None if folder is None else read_reconstruction(folder, _simulated_humanoid(config))
+    found = (
+        None if folder is None else read_reconstruction(folder, simulated_humanoid(str(config["forces"]["humanoid"])))
+    )
     numbers = [file for file in files if file.lower().endswith(NUMBERS)]
     if numbers and found is None:
         raise InputError(source, "to", f"{NUMBERS} needs a reconstruction: a folder with plan.npz")
@@ -119,11 +127,6 @@ def _write(motion: Motion, path: Path, target: Path, suffix: str, options: Mappi
 def _check_part(part: str) -> None:
     if part not in ("estimate", "reference"):
         raise InputError(_SOURCE, "part", f"must be estimate or reference, not {part!r}")
-
-
-def _simulated_humanoid(config: Mapping[str, Any]) -> HumanoidModel:
-    """As `egopose reconstruct` simulates it."""
-    return humanoid_of(compose_config("reconstruct", [f"humanoid={config['forces']['humanoid']}"]))
 
 
 def motion_files(source: Path, part: str, take: str | None) -> dict[str, Path]:

@@ -5,7 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from egopose.core.config import compose_config
 from egopose.core.errors import InputError
+from egopose.data.preparation import humanoid_of
 from egopose.humanoid.model import HumanoidModel
 from egopose.humanoid.replayed_forces import ReplayedForces, replay_forces, with_replayed_forces
 from egopose.motion.motion import Motion
@@ -50,6 +52,11 @@ def reconstruction_folder(source: Path) -> Path | None:
     """The folder of a reconstruction, of it or of its ``plan.npz``; None for anything else."""
     folder = source.parent if source.name == PLAN else source
     return folder if all((folder / name).is_file() for name in (PLAN, "body.npz", "scene.yaml")) else None
+
+
+def simulated_humanoid(choice: str = "default") -> HumanoidModel:
+    """The humanoid that `egopose reconstruct` simulates: of ``conf/humanoid/CHOICE``, at the rate of its settings."""
+    return humanoid_of(compose_config("reconstruct", [f"humanoid={choice}"]))
 
 
 def read_reconstruction(folder: Path, humanoid: HumanoidModel) -> Reconstruction:

@@ -7,7 +7,7 @@ plate's. A peak within one step of physics would tell how hard the simulated con
 from __future__ import annotations
 
 import csv
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -106,8 +106,16 @@ class MovementNumbers:
         return 60.0 / float(np.mean([step.time for step in self.steps])) if self.steps else float("nan")
 
     def rows(self) -> list[Row]:
-        """The table."""
-        return [*self._whole(), *self._flights(), *self._contacts(), *self._steps(), *self._joints()]
+        """The whole table."""
+        return [*self.summary(), *self.details()]
+
+    def summary(self) -> list[Row]:
+        """Figures of the whole movement, of flights and of joints."""
+        return [*self._whole(), *self._flights(), *self._means(), *self._joints()]
+
+    def details(self) -> list[Row]:
+        """Every contact of a foot and every step."""
+        return [*self._contacts(), *self._steps()]
 
     def _row(self, what: str, side: str, value: float, unit: str, begin: int, end: int) -> Row:
         return Row(what, side, float(value), unit, (begin / self.substeps, end / self.substeps))
@@ -133,34 +141,38 @@ class MovementNumbers:
             yield self._row(f"{name}peak vertical force of the landing", "", landing.peak, "BW", *after)
             yield self._row(f"{name}load rate of the landing", "", landing.load_rate, "BW/s", *after)
 
+    def _means(self) -> Iterator[Row]:
+        """Of contacts and steps."""
+        whole = [contact for contact in self.contacts if contact.whole]
+        times = {side: [contact.time for contact in whole if contact.side == side] for side in SIDES}
+        yield from self._mean("foot contact", times, "s", [(contact.begin, contact.end) for contact in whole])
+        spans = [(step.begin, step.end) for step in self.steps]
+        lengths = {side: [step.length for step in self.steps if step.side == side] for side in SIDES}
+        yield from self._mean("step length", lengths, "m", spans)
+        if self.steps:
+            yield self._row("cadence", "", self.cadence, "steps/min", spans[0][0], spans[-1][1])
+
+    def _mean(
+        self, what: str, values: Mapping[str, Sequence[float]], unit: str, spans: Sequence[tuple[int, int]]
+    ) -> Iterator[Row]:
+        for side, own in values.items():
+            if own:
+                yield self._row(f"mean {what}", side, float(np.mean(own)), unit, spans[0][0], spans[-1][1])
+        if all(values.values()):
+            yield self._asymmetry(f"mean {what}", *(float(np.mean(values[side])) for side in SIDES))
+
     def _contacts(self) -> Iterator[Row]:
-        mean = {}
-        for side in SIDES:
-            own = [contact for contact in self.contacts if contact.side == side]
-            whole = [contact for contact in own if contact.whole]
-            for contact in own:
-                cut = "" if contact.whole else " (cut by the clip)"
-                yield self._row(f"foot contact{cut}", side, contact.time, "s", contact.begin, contact.end)
-                yield self._row(
-                    "peak vertical force of the contact", side, contact.peak, "BW", contact.begin, contact.end
-                )
-            if whole:
-                mean[side] = float(np.mean([contact.time for contact in whole]))
-                yield self._row("mean foot contact", side, mean[side], "s", whole[0].begin, whole[-1].end)
-        if len(mean) == 2:
-            yield self._asymmetry("mean foot contact", mean["right"], mean["left"])
+        for contact in self.contacts:
+            span = contact.begin, contact.end
+            cut = "" if contact.whole else ", cut by the clip"
+            yield self._row(f"foot contact{cut}", contact.side, contact.time, "s", *span)
+            yield self._row("foot contact, peak vertical force", contact.side, contact.peak, "BW", *span)
 
     def _steps(self) -> Iterator[Row]:
         for step in self.steps:
             kind = "running step" if step.flight else "step"
             yield self._row(f"{kind} length", step.side, step.length, "m", step.begin, step.end)
             yield self._row(f"{kind} time", step.side, step.time, "s", step.begin, step.end)
-        if self.steps:
-            span = self.steps[0].begin, self.steps[-1].end
-            yield self._row("cadence", "", self.cadence, "steps/min", *span)
-            mean = {side: [step.length for step in self.steps if step.side == side] for side in SIDES}
-            if all(mean.values()):
-                yield self._asymmetry("step length", *(float(np.mean(mean[side])) for side in SIDES))
 
     def _joints(self) -> Iterator[Row]:
         last = (self.frames - 1) * self.substeps

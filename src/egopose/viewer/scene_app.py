@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import queue
 import threading
 from collections.abc import Callable
@@ -13,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from egopose.core.errors import InputError
-from egopose.inference.scene_stages import load_projection
+from egopose.inference.scene_stages import film_of, load_projection
 from egopose.motion.io.native import read_native
 from egopose.scene.drawing import body_points, draw_bones, draw_box
 from egopose.scene.edits import add_box, remove_box, remove_contact, with_box, with_contact
@@ -54,7 +53,7 @@ class SceneViewer:
         self.scene = read_scene(folder / "scene.yaml")
         self._body = read_native(folder / "body.npz")
         self._projection = load_projection(folder / "projection.npz")
-        film = _film(folder) if video is None else video
+        film = film_of(folder) if video is None else video
         self._pictures, self._width = None, 1
         if film is not None:
             self._width = probe_video(film).width
@@ -266,12 +265,3 @@ class SceneViewer:
 def is_scene_folder(path: Path) -> bool:
     """Whether a folder holds results of `egopose reconstruct prepare`."""
     return all((path / name).is_file() for name in ("scene.yaml", "body.npz", "projection.npz"))
-
-
-def _film(folder: Path) -> Path | None:
-    """Where the film was; None where there was none, or it is gone."""
-    try:
-        video = json.loads((folder / "clip.json").read_text()).get("video")
-    except (OSError, ValueError):
-        return None
-    return Path(video) if isinstance(video, str) and Path(video).is_file() else None
