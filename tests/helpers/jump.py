@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from functools import lru_cache
 from pathlib import Path
 
@@ -15,9 +16,12 @@ from egopose.inference.scene_stages import save_projection
 from egopose.motion.io.native import write_native
 from egopose.motion.motion import Motion
 from egopose.scene.clip import box_poses, humanoid_in
+from egopose.scene.poses.keypoints import BODY_25
+from egopose.scene.poses.track import PoseTrack
 from egopose.scene.projection import Projection
 from egopose.scene.scene_file import Box, Contact, Scene, write_scene
 from egopose.scene.simulated import SimulatedMotion
+from egopose.vision.video import write_video
 
 UPRIGHT = 0.0222 + 0.4767 + 0.4982 + 0.075  # m, of the root with straight legs, soles at height zero
 STEP = Box("step", (0.6, 0.8), (0.0, 0.0), 0.3, 0.2)
@@ -77,8 +81,11 @@ def scene_at(height: float) -> Scene:
     return Scene(boxes=(step, FAR), contacts=contacts)
 
 
-def write_folder(folder: Path, motion: SimulatedMotion, scene: Scene) -> Path:
-    """As `egopose reconstruct` leaves it: the motion itself is the clip, slid by 0.1 m along x in its course."""
+def write_folder(folder: Path, motion: SimulatedMotion, scene: Scene, film: bool = False) -> Path:
+    """As `egopose reconstruct` leaves it: the motion itself is the clip, slid by 0.1 m along x in its course.
+
+    The film, where there is one, is red.
+    """
     folder.mkdir(parents=True, exist_ok=True)
     frames = len(motion)
     qpos = motion.qpos.copy()
@@ -91,6 +98,13 @@ def write_folder(folder: Path, motion: SimulatedMotion, scene: Scene) -> Path:
     np.savez(folder / "contacts.npz", touching=touching, probability=touching.astype(float))
     matrix = np.tile(np.array([[40.0, 0, 0], [0, 0, -40.0]]), (frames, 1, 1))
     save_projection(Projection(matrix, np.tile([80.0, 100.0], (frames, 1))), folder / "projection.npz")
+    pixels = np.full((frames, len(BODY_25), 2), 80.0)
+    PoseTrack(BODY_25, pixels, np.ones(pixels.shape[:2]), 30.0, (160, 120)).save(folder / "poses.npz")
+    if film:
+        red = np.broadcast_to(np.array([200, 0, 0], np.uint8), (frames, 120, 160, 3)).copy()
+        write_video(folder / "film.mp4", red, 30.0)
+    video = str(folder / "film.mp4") if film else None
+    (folder / "clip.json").write_text(json.dumps({"start": 0, "stop": frames, "of": frames, "video": video}))
     write_scene(scene, folder / "scene.yaml")
     motion.save(folder / "plan.npz")
     return folder

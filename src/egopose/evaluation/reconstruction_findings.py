@@ -128,14 +128,15 @@ class Findings:
     def _missing(self) -> Iterator[str]:
         for one in self.contacts:
             for first, stop in _spans(one.wanted & ~one.found):
-                yield f"{_said(first, stop)}: the {_plain(one.effector)} should touch {one.surface} and does not."
+                missing = f"the {_plain(one.effector)} should touch {_named(one.surface)}"
+                yield f"{_said(first, stop)}: {missing} and does not."
 
     def _beyond(self) -> Iterator[str]:
         anywhere = {e: np.any([c.wanted for c in self.contacts if c.effector == e], axis=0) for e in BODIES}
         for one in self.contacts:
             for first, stop in _spans(one.found & ~one.wanted):
                 instead = ", instead of what it should touch" if anywhere[one.effector][first:stop].all() else ""
-                touches = f"the {_plain(one.effector)} touches {one.surface}{instead}"
+                touches = f"the {_plain(one.effector)} touches {_named(one.surface)}{instead}"
                 yield f"{_said(first, stop)}: {touches}; the scene does not say so."
 
     def _fallen(self) -> Iterator[str]:
@@ -145,7 +146,8 @@ class Findings:
             touched = self.touching[:, others, column]
             for first, stop in runs_of(touched.any(axis=1)):
                 bodies = [names[others[k]] for k in np.flatnonzero(touched[first:stop].any(axis=0))]
-                yield f"{_said(first, stop)}: {', '.join(bodies)} on {surface}: only feet and hands should touch."
+                lying = f"{', '.join(bodies)} on {_named(surface)}"
+                yield f"{_said(first, stop)}: {lying}: only feet and hands should touch."
 
     def _away(self) -> Iterator[str]:
         for first, stop in _spans(self.root_distance > _FAR):
@@ -168,3 +170,7 @@ def _said(first: int, stop: int) -> str:
 
 def _plain(effector: str) -> str:
     return effector.replace("_", " ")
+
+
+def _named(surface: str) -> str:
+    return "the floor" if surface == FLOOR else surface

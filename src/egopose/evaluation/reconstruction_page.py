@@ -179,18 +179,16 @@ def _boxes(found: Reconstruction) -> Table:
     fitted = {box.name: box for box in read_scene(path).boxes} if path.is_file() else {}
     rows = []
     for first, simulated in zip(found.clip.scene.boxes, found.scene.boxes, strict=True):
-        cells = [cell for box in (first, fitted.get(first.name), simulated) for cell in _box_cells(box)]
-        rows.append([first.name, *cells])
-    whose = ("first guess", "fitted", "simulated")
-    return Table(["box", *(f"{name}: {what}" for name in whose for what in ("height (m)", "place (m)"))], rows)
+        for whose, box in (("first guess", first), ("fitted", fitted.get(first.name)), ("simulated", simulated)):
+            if box is not None:
+                rows.append([first.name, whose, *_box_cells(box)])
+    return Table(["box", "", "height (m)", "place (m)", "yaw (degrees)"], rows)
 
 
-def _box_cells(box: Box | None) -> Iterator[Any]:
-    if box is None or box.place is None:
-        yield from (Number(None), "-")
-        return
+def _box_cells(box: Box) -> Iterator[Any]:
     yield Number(box.height, 2)
-    yield ", ".join(f"{value:.2f}" for value in box.place)
+    yield "-" if box.place is None else ", ".join(f"{value:.2f}" for value in box.place)
+    yield Number(None if box.yaw is None else float(np.rad2deg(box.yaw)), 0)
 
 
 def _numbers(rows: Sequence[Row]) -> Table:

@@ -23,6 +23,7 @@ _KINEMATIC, _SIMULATED = (190, 190, 190), (70, 230, 110)
 _ROUND = 1.5  # times the body's extent in the film: the cut around it
 _ACROSS = 4  # moments beside each other
 _DISTANCE, _ASIDE = 3.4, 1.3  # m from the camera to the body, and more for each m that the two bodies are apart
+_APART = 1.5  # m: bodies further apart are looked at each by itself
 _GREY = 120
 
 
@@ -113,11 +114,13 @@ class _Renderer:
         self._inner.close()
 
     def draw(self, pose: Array, projection: Projection, t: int, turn: float) -> Frame:
-        """Both bodies of a moment are looked at from one place: how far they are apart is seen."""
+        """Bodies near each other are looked at from one place: how far they are apart is seen."""
         first, second = (root[t] for root in self._roots)
+        apart = float(np.linalg.norm(first - second))
+        near = apart < _APART
         azimuth, elevation = view_of(projection)
-        self._view.lookat = 0.5 * (first + second) - [0, 0, 0.15]
-        self._view.distance = _DISTANCE + _ASIDE * float(np.linalg.norm(first - second))
+        self._view.lookat = (0.5 * (first + second) if near else pose[:3]) - [0, 0, 0.15]
+        self._view.distance = _DISTANCE + (_ASIDE * apart if near else 0.0)
         self._view.azimuth, self._view.elevation = azimuth + turn, min(elevation, -5.0)
         return self._inner.render(pose, self._view)
 
