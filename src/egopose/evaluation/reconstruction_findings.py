@@ -144,7 +144,7 @@ class Findings:
         others = [row for row, name in enumerate(names) if name not in BODIES.values()]
         for column, surface in enumerate(self.surfaces):
             touched = self.touching[:, others, column]
-            for first, stop in runs_of(touched.any(axis=1)):
+            for first, stop in runs_of(np.any(touched, axis=1)):
                 bodies = [names[others[k]] for k in np.flatnonzero(touched[first:stop].any(axis=0))]
                 lying = f"{', '.join(bodies)} on {_named(surface)}"
                 yield f"{_said(first, stop)}: {lying}: only feet and hands should touch."

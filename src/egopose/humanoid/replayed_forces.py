@@ -163,7 +163,7 @@ def with_replayed_forces(motion: Motion, humanoid: HumanoidModel, forces: Replay
         humanoid: that was simulated.
         forces: of its replay.
     """
-    touching = forces.any_at_frame(forces.touching.any(axis=2))
+    touching = forces.any_at_frame(np.any(forces.touching, axis=2))
     kept = np.union1d(humanoid.feet, np.flatnonzero(touching.any(axis=0)))
     summed = {name: getattr(forces, name)[:, kept].sum(axis=2) for name in ("force", "moment", "normal", "pressure")}
     mean = {name: forces.per_frame(values) for name, values in summed.items()}

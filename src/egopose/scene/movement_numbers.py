@@ -206,9 +206,9 @@ def movement_numbers(humanoid: HumanoidModel, forces: ReplayedForces, box_tops: 
     vertical = upward.sum(axis=1)
     standing = standing_height(humanoid) + _support_height(touching, box_tops)
     air = flights(
-        touching.any(axis=(1, 2)), forces.com, forces.com_velocity, standing, forces.rate, gravity=forces.gravity
+        np.any(touching, axis=(1, 2)), forces.com, forces.com_velocity, standing, forces.rate, gravity=forces.gravity
     )
-    contacts = foot_contacts(touching[:, feet].any(axis=2), upward[:, feet], forces.rate)
+    contacts = foot_contacts(np.any(touching[:, feet], axis=2), upward[:, feet], forces.rate)
     return MovementNumbers(
         tuple(air),
         tuple(landings(air, vertical, forces.rate)),
@@ -251,7 +251,7 @@ def write_numbers_csv(rows: Sequence[Row], path: Path) -> None:
 def _support_height(touching: NDArray[np.bool_], box_tops: Array) -> Array:
     """``[N]`` m: the highest surface that is touched, held while nothing is."""
     heights = np.concatenate([[0.0], box_tops[:, 2]])
-    touched: NDArray[np.bool_] = touching.any(axis=1)
+    touched: NDArray[np.bool_] = np.any(touching, axis=1)
     highest = np.where(touched, heights, -np.inf).max(axis=1)
     known = np.maximum.accumulate(np.where(touched.any(axis=1), np.arange(len(touching)), 0))
     out = highest[known]
