@@ -12,6 +12,7 @@ estimate: the command `egopose estimate` on a film, beside the film's own length
 resume: a training killed at random moments beside the same one left alone.
 retarget: frames a second of retargeting to the humanoid, on one core.
 export: what every export format loses, by independent readers.
+scenes: a third person's reconstruction against true motions among boxes, by cameras.
 film: estimates from rendered films against the true motion, by cameras; whether bad films are told.
 """
 
@@ -23,6 +24,7 @@ import sys
 from collections.abc import Sequence
 from importlib import import_module
 
+from egopose.benchmarks.words import as_settings
 from egopose.core.errors import InputError
 from egopose.core.result_files import finite_or_null
 from egopose.core.verbs import BENCHMARKS
@@ -34,7 +36,7 @@ def command_line() -> argparse.ArgumentParser:
         prog="egopose bench", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("verb", choices=list(BENCHMARKS))
-    parser.add_argument("overrides", nargs="*", metavar="key=value", help="of the training configuration")
+    parser.add_argument("overrides", nargs="*", metavar="key=value", help="settings; --key a b says key=a,b")
     parser.add_argument("--json", action="store_true", help="one JSON object on standard output")
     parser.add_argument("--rounds", type=int, help="how often: rounds, or kills (resume), or lengths (stream)")
     return parser
@@ -42,7 +44,7 @@ def command_line() -> argparse.ArgumentParser:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Command line."""
-    options = command_line().parse_intermixed_args(arguments)
+    options = command_line().parse_intermixed_args(as_settings(sys.argv[1:] if arguments is None else arguments))
     verb = import_module(f"egopose.benchmarks.{options.verb}")
     try:
         result = verb.run(options.overrides, BENCHMARKS[options.verb] if options.rounds is None else options.rounds)

@@ -23,7 +23,9 @@ from egopose.inference import scene_stages
 from egopose.inference.scene_preparation import prepare_scene
 from egopose.inference.scene_stages import Sources
 from egopose.motion.io.native import read_native
-from egopose.scene.poses.track import PoseTrack
+from egopose.scene.camera import CameraTrack
+from egopose.scene.camera_file import save_camera
+from egopose.scene.poses.track import PoseTrack, load_track
 from egopose.scene.scene_file import Box, read_scene, write_scene
 
 REPEATS = 3  # the walk is one stride of a second
@@ -182,3 +184,38 @@ def test_the_verb_says_what_it_can_do() -> None:
     done = subprocess.run([sys.executable, "-m", "egopose.reconstruct"], capture_output=True, text=True, check=False)
     assert done.returncode == 2
     assert "say what to do: prepare" in done.stderr
+
+
+def moved_by(frames: int, pixels: float) -> CameraTrack:
+    to_first = np.tile(np.eye(3), (frames, 1, 1))
+    to_first[:, 0, 2] = pixels * np.arange(frames)
+    return CameraTrack(to_first, np.zeros(frames, bool), np.ones(frames), "similarity")
+
+
+def test_a_cameras_known_motion_is_undone(prepared: Path, tmp_path: Path) -> None:
+    """Keypoints of a camera that turns, and its motion, give what a camera that stands gives."""
+    track = long_walk()
+    pixels = track.pixels.copy()
+    pixels[..., 0] -= 2.0 * np.arange(len(track))[:, None]
+    replace(track, pixels=pixels).save(tmp_path / "walk.npz")
+    save_camera(moved_by(len(track), 2.0), tmp_path / "camera.npz")
+    words = (f"poses={tmp_path / 'walk.npz'}", f"camera.track={tmp_path / 'camera.npz'}")
+    out = prepare_scene(settings(tmp_path, *words), no_page)
+    turned, still = (load_track(folder / "mended.npz") for folder in (out, prepared / "out"))
+    np.testing.assert_allclose(turned.pixels, still.pixels, atol=1e-6)
+    assert read_scene(out / "scene.yaml").camera.motion == "pan"
+    before = (out / "camera.npz").read_bytes()
+    save_camera(moved_by(len(track), 1.0), tmp_path / "camera.npz")
+    prepare_scene(settings(tmp_path, *words), no_page)
+    assert (out / "camera.npz").read_bytes() != before
+
+
+def test_a_cameras_motion_of_other_frames_is_refused(tmp_path: Path) -> None:
+    track = long_walk()
+    track.save(tmp_path / "walk.npz")
+    save_camera(moved_by(len(track) - 1, 2.0), tmp_path / "camera.npz")
+    words = (f"poses={tmp_path / 'walk.npz'}", f"camera.track={tmp_path / 'camera.npz'}")
+    with pytest.raises(InputError, match=f"there are poses of {len(track)}"):
+        prepare_scene(settings(tmp_path, *words), no_page)
+    with pytest.raises(InputError, match="no such file"):
+        prepare_scene(settings(tmp_path, words[0], "camera.track=nowhere.npz"), no_page)

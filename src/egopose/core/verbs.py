@@ -38,4 +38,5 @@ BENCHMARKS = {
     "plan": 9,
     "estimate": 3,
     "film": 2,
+    "scenes": 1,
 }

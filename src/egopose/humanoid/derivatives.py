@@ -77,6 +77,15 @@ class Simulator:
         self.steps += len(qpos)
         return after_qpos, after_qvel
 
+    def place_boxes(self, top: Array, heading: Array) -> None:
+        """Put the humanoid's boxes at ``top [K, 3]`` m and ``heading [K]`` rad in all worlds.
+
+        Raises:
+            ValueError: a place where a box cannot be.
+        """
+        count = self._physics.num_envs
+        self._physics.place_boxes(slice(None), np.tile(top, (count, 1, 1)), np.tile(heading, (count, 1)))
+
     def close(self) -> None:
         """Stop the threads."""
         self._physics.close()

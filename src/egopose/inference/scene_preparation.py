@@ -28,7 +28,7 @@ from egopose.vision.video import probe_video
 COSTS = {"poses": 250.0, "camera": 40.0, "sides": 2.0, "contacts": 1.0, "joints": 1.0, "motion": 20.0, "root": 3.0}
 COSTS |= {"scene": 1.0, "page": 30.0}
 #: Changes with what the stages compute from the same inputs.
-_VERSION = 4
+_VERSION = 5
 _SCENE = "scene.yaml"
 
 
@@ -155,9 +155,13 @@ def _inputs(values: Mapping[str, Any], sources: Sources, network: Path) -> dict[
         files = sorted(sources.poses.glob("*.json")) if sources.poses.is_dir() else [sources.poses]
         found = [[file.name, sha256_of(file)] for file in files]
     told = {"video": film, "found": found, "fps": sources.fps}
+    known = convert(values["camera"]["track"], str | None, "conf/reconstruct.yaml", "camera.track")
+    if known is not None and not Path(known).expanduser().is_file():
+        raise InputError(known, "camera.track", "no such file")
+    tracked = {} if known is None else {"track": sha256_of(Path(known).expanduser())}
     return {
         "poses": {**told, "at": values["at"], "read": values["read"], "turns": values["estimator"]["turns"]},
-        "camera": {"video": film, **values["camera"]},
+        "camera": {"video": film, "kind": values["camera"]["kind"], **tracked},
         "contacts": {**{k: v for k, v in values["contacts"].items() if k != "network"}, "weights": _weights(network)},
     }
 

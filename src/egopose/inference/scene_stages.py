@@ -22,18 +22,20 @@ from egopose.motion.io.native import read_native, write_native
 from egopose.motion.motion import Motion
 from egopose.motion.rotations import Array
 from egopose.scene.articulation import articulated
+from egopose.scene.balance import lean, leaned
 from egopose.scene.camera import CameraTrack, camera_motion
+from egopose.scene.camera_file import given_camera, load_camera, save_camera
 from egopose.scene.contacts import FEET, LOWER_BODY, ContactNetwork, estimate_contacts
 from egopose.scene.lifting import LiftingNetwork, lifted_track
 from egopose.scene.poses.blazepose import BlazePose
 from egopose.scene.poses.keypoints import BODY_25, HUMANOID_JOINTS
-from egopose.scene.poses.mending import fill_gaps
+from egopose.scene.poses.mending import MADE_UP, fill_gaps
 from egopose.scene.poses.readers import read_poses
 from egopose.scene.poses.sides import mend_sides
 from egopose.scene.poses.timing import cut, known_span, resampled
 from egopose.scene.poses.track import PoseTrack, load_track
 from egopose.scene.projection import Projection, fit_projection
-from egopose.scene.root import RootSettings, SeenSteps, Support, kinematic_root
+from egopose.scene.root import KinematicRoot, RootSettings, SeenSteps, Support, kinematic_root
 from egopose.scene.scene_file import Scene, write_scene
 from egopose.scene.supports import filled_scene, floor_height, levels, told_contacts, touched
 from egopose.scene.upright import focal_length, orientation, view_turns
@@ -102,9 +104,12 @@ def _read(values: Mapping[str, Any], poses: Path, video: Path | None, at: tuple[
 
 
 def follow_camera(values: Mapping[str, Any], sources: Sources, folder: Path, advance: Advance, out: Path) -> None:
-    """``camera.npz``: by the film's background; a camera that stands where there is no film."""
+    """``camera.npz``: given, else by the film's background; a camera that stands where there is no film."""
     track = load_track(folder / "poses.npz")
-    if sources.video is None:
+    given = convert(values["camera"]["track"], str | None, _SOURCE, "camera.track")
+    if given is not None:
+        camera = given_camera(Path(given).expanduser(), len(track))
+    elif sources.video is None:
         frames = len(track)
         camera = CameraTrack(np.tile(np.eye(3), (frames, 1, 1)), np.zeros(frames, bool), np.ones(frames), "similarity")
     else:
@@ -126,18 +131,6 @@ def _as_many(frames: Iterable[Frame], count: int) -> Iterator[Frame]:
     while number < count and last is not None:
         number += 1
         yield last
-
-
-def save_camera(camera: CameraTrack, path: Path) -> None:
-    kind = np.frombuffer(camera.kind.encode(), dtype=np.uint8)
-    np.savez_compressed(path, to_first=camera.to_first, degenerate=camera.degenerate, alike=camera.alike, kind=kind)
-
-
-def load_camera(path: Path) -> CameraTrack:
-    """Read what :func:`save_camera` wrote."""
-    arrays = read_arrays(path, ("to_first", "degenerate", "alike", "kind"))
-    kind = arrays["kind"].tobytes().decode()
-    return CameraTrack(arrays["to_first"], arrays["degenerate"], arrays["alike"], kind)
 
 
 def mend(folder: Path, sources: Sources, out: Path) -> None:
@@ -250,14 +243,12 @@ def _held(values: Array) -> Array:
 def place_root(folder: Path, source: Path, scene: Scene, humanoid: HumanoidModel, out: Path) -> None:
     """``body.npz``: the motion in the world, floor at 0; ``root.npz``: supports; ``projection.npz``: to the film."""
     motion, touching = read_native(folder / "motion.npz"), touching_of(folder, scene)
-    motion = replace(motion, qpos=motion.qpos.copy())
     if not touching.any():
         raise InputError(source, "contacts", "no foot touches anything: say which frames do in the scene file")
-    pelvis = motion.qpos[:, :3]
-    feet = _soles(humanoid, motion) - pelvis[:, None, None]
-    com = reference_states(humanoid, motion)["com"].numpy() - pelvis
-    seen = _seen_steps(folder, motion) if camera_moves(folder, scene) != "track" else None
-    root = kinematic_root(feet, touching, com, motion.fps, _ROOT, seen)
+    moves = camera_moves(folder, scene) != "track"
+    root = _root(folder, motion, touching, humanoid, moves)
+    motion = _balanced(folder, motion, touching, root, humanoid)
+    root = _root(folder, motion, touching, humanoid, moves)
     floor = floor_height(root.supports, touched(scene, root.supports))
     qpos = motion.qpos.copy()
     qpos[:, :3] = root.positions - [0.0, 0.0, floor]
@@ -267,6 +258,29 @@ def place_root(folder: Path, source: Path, scene: Scene, humanoid: HumanoidModel
     rows = np.array([[s.foot, s.start, s.stop, s.height - floor] for s in root.supports])
     np.savez_compressed(out / "root.npz", supports=rows, flight=root.flight)
     save_projection(_projection(folder, body), out / "projection.npz")
+
+
+def _root(
+    folder: Path, motion: Motion, touching: NDArray[np.bool_], humanoid: HumanoidModel, seen: bool
+) -> KinematicRoot:
+    """Of poses anywhere; ``seen`` whether pictures tell how the pelvis moves."""
+    pelvis = motion.qpos[:, :3]
+    feet = sole_points(humanoid, motion) - pelvis[:, None, None]
+    com = reference_states(humanoid, motion)["com"].numpy() - pelvis
+    return kinematic_root(feet, touching, com, motion.fps, _ROOT, _seen_steps(folder, motion) if seen else None)
+
+
+def _balanced(
+    folder: Path, motion: Motion, touching: NDArray[np.bool_], root: KinematicRoot, humanoid: HumanoidModel
+) -> Motion:
+    """The motion leaned so that its feet carry it."""
+    feet = sole_points(humanoid, motion).mean(axis=2)
+    com = reference_states(humanoid, motion)["com"].numpy()
+    # Where contacts were missed, the lower foot carries.
+    lower = np.arange(feet.shape[1]) == feet[..., 2].argmin(axis=1)[:, None]
+    stands = touching | (lower & ~touching.any(axis=1, keepdims=True) & ~root.flight[:, None])
+    sight = read_arrays(folder / "orientation.npz", ("to_world",))["to_world"][:, :, 2]
+    return replace(motion, qpos=leaned(motion.qpos, lean(feet, stands, com, sight, motion.fps)))
 
 
 def _seen_steps(folder: Path, motion: Motion) -> SeenSteps | None:
@@ -283,7 +297,7 @@ def _seen_steps(folder: Path, motion: Motion) -> SeenSteps | None:
     return SeenSteps(axes, np.diff(hips, axis=0) / np.sqrt(scale[1:] * scale[:-1])[:, None])
 
 
-def _soles(humanoid: HumanoidModel, motion: Motion) -> Array:
+def sole_points(humanoid: HumanoidModel, motion: Motion) -> Array:
     """``[T, 2, 2, 3]`` m: the right and the left foot's heel and ball."""
     names = [humanoid.skeleton.names[foot] for foot in humanoid.feet]
     order = [names.index(f"{side.capitalize()}Foot") for side in FEET]
@@ -317,10 +331,18 @@ def supports_of(folder: Path) -> tuple[Support, ...]:
     return tuple(Support(int(foot), int(start), int(stop), float(height)) for foot, start, stop, height in rows)
 
 
+def trust_of(folder: Path) -> Array:
+    """``[T]`` how far each frame is to be believed: the median confidence of its keypoints that are known."""
+    track = load_track(folder / "joints.npz")
+    seen = np.nanmedian(np.where(track.confidence > 0, track.confidence, np.nan), axis=1)
+    trust: Array = np.clip(np.nan_to_num(seen, nan=MADE_UP), MADE_UP, 1.0)
+    return trust
+
+
 def fill_scene(folder: Path, scene: Scene, humanoid: HumanoidModel, out: Path) -> None:
     """``scene.yaml``: the scene with what it left out."""
     body, supports = read_native(folder / "body.npz"), supports_of(folder)
-    soles = _soles(humanoid, body).mean(axis=2)[..., :2]
+    soles = sole_points(humanoid, body).mean(axis=2)[..., :2]
     heading = body.qpos[:, 3:7]
     yaws = 2 * np.arctan2(heading[:, 3], heading[:, 0])
     touches = touched(scene, supports)

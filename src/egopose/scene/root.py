@@ -39,6 +39,8 @@ class RootSettings:
         ballistic: least share of a time without contact that take-off and landing speeds must tell of, to be a flight.
         seen: m/s, of the pelvis's speed across the line of sight: a pixel at 100 pixels a metre and 30 frames/s is 0.3.
         moving: m/s: both feet are seen to move faster through most of a flight.
+        fall: least share of gravity by which the pelvis is seen to accelerate downwards in a flight.
+        fall_frames: fewest steps from which that is told: a speed is known to 0.3 m/s in each.
     """
 
     slip: float = 0.02
@@ -53,6 +55,8 @@ class RootSettings:
     ballistic: float = 0.2
     seen: float = 0.5
     moving: float = 0.6
+    fall: float = 0.5
+    fall_frames: int = 8
 
 
 @dataclass(frozen=True)
@@ -131,7 +135,7 @@ def kinematic_root(
     if seen is not None and (seen.axes.shape, seen.steps.shape) != ((len(feet) - 1, 2, 3), (len(feet) - 1, 2)):
         raise ValueError(f"seen must be of {len(feet) - 1} steps: {list(seen.axes.shape)}, {list(seen.steps.shape)}")
     moving = _moving(steps, seen, fps, settings)
-    firmness, flight = _firmness(contacts, feet, steps, center_of_mass, moving, fps, settings)
+    firmness, flight = _firmness(contacts, feet, steps, center_of_mass, moving, seen, fps, settings)
     positions = _least_squares(steps, firmness, flight, center_of_mass, seen, fps, settings)
     lowest = positions[:, None, 2] + feet[..., 2].min(axis=2)
     supports = _levelled(lowest, contacts, settings)
@@ -153,6 +157,7 @@ def _firmness(
     steps: Array,
     center_of_mass: Array,
     moving: NDArray[np.bool_],
+    seen: SeenSteps | None,
     fps: float,
     settings: RootSettings,
 ) -> tuple[Array, NDArray[np.bool_]]:
@@ -178,7 +183,7 @@ def _firmness(
         if start > 0 and stop < frames:
             left, landed = (_rise(steps, contacts, center_of_mass, frame, fps) for frame in (start - 1, stop))
             told = (left - landed) / GRAVITY * fps
-        if np.mean(moving[max(start - 1, 0) : stop] if len(moving) else [0.0]) > 0.5:
+        if _seen_to_fly(seen, start, stop, fps, moving, settings):
             flight[start:stop] = True
         elif told >= settings.ballistic * (stop - start):
             spare = int(max(0.0, (stop - start - told) / 2))
@@ -186,6 +191,24 @@ def _firmness(
         else:
             out[np.arange(start, stop), lower[start:stop]] = settings.guessed
     return out, flight
+
+
+def _seen_to_fly(
+    seen: SeenSteps | None, start: int, stop: int, fps: float, moving: NDArray[np.bool_], settings: RootSettings
+) -> bool:
+    """Whether pictures show a flight in frames ``start .. stop - 1``: both feet move, and the pelvis falls freely.
+
+    Falling is told by the pelvis's seen acceleration along gravity, where there are frames enough to tell it.
+    """
+    if seen is None or np.mean(moving[max(start - 1, 0) : stop]) <= 0.5:
+        return False
+    axes, speeds = seen.axes[start : stop - 1, :, 2], seen.steps[start : stop - 1] * fps
+    if len(axes) < settings.fall_frames:
+        return True
+    # The picture's own axis that is nearest to the vertical tells most.
+    row = int(np.abs(axes).mean(axis=0).argmax())
+    pull = float(np.polyfit(np.arange(len(speeds)) / fps, speeds[:, row], 1)[0])
+    return pull * float(np.sign(axes[:, row].mean())) < -settings.fall * GRAVITY
 
 
 def _rise(steps: Array, contacts: np.ndarray, center_of_mass: Array, frame: int, fps: float) -> float:
