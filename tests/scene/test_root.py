@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from helpers.mocap import default_humanoid
@@ -11,7 +13,7 @@ from egopose.data.reference import reference_states
 from egopose.humanoid.foot_geometry import sole_positions
 from egopose.motion.contacts import contact_labels
 from egopose.motion.rotations import Array
-from egopose.scene.root import GRAVITY, SeenSteps, kinematic_root
+from egopose.scene.root import GRAVITY, RootSettings, SeenPlaces, kinematic_root
 
 FPS = 30.0
 
@@ -107,6 +109,14 @@ def test_a_step_whose_contact_was_missed_is_no_flight() -> None:
     assert np.abs(root.positions - pelvis).max() < 0.02
 
 
+def seen_from_afar(pelvis: Array, error: float) -> SeenPlaces:
+    """By a camera that looks along y from 6 m, with errors (m)."""
+    camera = np.array([1.0, -6.0, 1.0])
+    axes = np.tile(np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]), (len(pelvis), 1, 1))
+    noise = np.random.default_rng(0).normal(scale=error, size=pelvis.shape)
+    return SeenPlaces(pelvis - camera + noise, axes, pelvis[:, 1] + 6.0)
+
+
 def test_pictures_tell_how_far_a_body_falls() -> None:
     """A step off a roof, whose take-off and landing show no speed: only pixels tell of the fall."""
     stand, flight = 12, 19
@@ -116,17 +126,30 @@ def test_pictures_tell_how_far_a_body_falls() -> None:
     contacts = np.ones((len(pelvis), 2), dtype=bool)
     contacts[stand : stand + flight - 1] = False
     drop = 0.5 * GRAVITY * (flight / FPS) ** 2
-    axes = np.tile(np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0]]), (len(pelvis) - 1, 1, 1))
-    rng = np.random.default_rng(0)
-    steps = np.einsum("tij,tj->ti", axes, np.diff(pelvis, axis=0)) + rng.normal(scale=0.01, size=(len(pelvis) - 1, 2))
-    seen = SeenSteps(axes, steps)
+    seen = seen_from_afar(pelvis, 0.02)
     blind = kinematic_root(feet_of(pelvis, soles), contacts, np.zeros_like(pelvis), FPS)
     told = kinematic_root(feet_of(pelvis, soles), contacts, np.zeros_like(pelvis), FPS, seen=seen)
     last = [support.height for support in told.supports][-1]
     assert last == pytest.approx(-drop, abs=0.15)
     assert [support.height for support in blind.supports][-1] > -0.5 * drop
     with pytest.raises(ValueError, match="seen"):
-        kinematic_root(feet_of(pelvis, soles), contacts, np.zeros_like(pelvis), FPS, seen=SeenSteps(axes[1:], steps))
+        kinematic_root(
+            feet_of(pelvis, soles), contacts, np.zeros_like(pelvis), FPS, seen=replace(seen, axes=seen.axes[1:])
+        )
+
+
+def test_pictures_hold_a_body_to_its_way_where_feet_mislead() -> None:
+    """Feet that seem to take strides half as long again: pictures know better, once poses are trusted little."""
+    times = np.arange(90) / FPS
+    pelvis = np.stack([1.2 * times, 0 * times, 1.0 + 0 * times], axis=1)
+    contacts = np.ones((90, 1), dtype=bool)
+    feet = (np.zeros((90, 1, 3)) - 1.5 * pelvis[:, None] * [1.0, 0.0, 0.0] - [0.0, 0.0, 1.0])[:, :, None]
+    settings = RootSettings(slip=0.5)
+    blind = kinematic_root(feet, contacts, np.zeros_like(pelvis), FPS, settings)
+    told = kinematic_root(feet, contacts, np.zeros_like(pelvis), FPS, settings, seen_from_afar(pelvis, 0.02))
+    end = pelvis[-1, 0] - pelvis[0, 0]
+    assert blind.positions[-1, 0] == pytest.approx(1.5 * end, rel=0.05)
+    assert told.positions[-1, 0] == pytest.approx(end, rel=0.05)
 
 
 @pytest.mark.parametrize("fault", ["contacts", "com", "nan", "nothing"])

@@ -35,18 +35,21 @@ from egopose.scene.poses.sides import mend_sides
 from egopose.scene.poses.timing import cut, known_span, resampled
 from egopose.scene.poses.track import PoseTrack, load_track
 from egopose.scene.projection import Projection, fit_projection
-from egopose.scene.root import KinematicRoot, RootSettings, SeenSteps, Support, kinematic_root
+from egopose.scene.root import KinematicRoot, RootSettings, SeenPlaces, Support, kinematic_root
 from egopose.scene.scene_file import Scene, write_scene
 from egopose.scene.supports import filled_scene, floor_height, levels, told_contacts, touched
-from egopose.scene.upright import focal_length, orientation, view_turns
+from egopose.scene.upright import first_to_world, focal_length, orientation, view_turns
 from egopose.vision.video import Frame, iter_frames, probe_video
 
 _SOURCE = "conf/reconstruct.yaml"
 #: px and shares of the picture: a background that moves less than this stands still.
 _STILL = 0.02
 _LEAST_FRAMES = 9
-#: One camera's depths are less sure than mocap's: feet on one floor lie further apart in height.
-_ROOT = RootSettings(level=0.15, level_in_flight=0.25)
+#: One camera's poses are less sure than mocap's, and their errors last. Chosen on the bench of scenes, fixed camera.
+_ROOT = RootSettings(level=0.15, level_in_flight=0.25, slip=0.5, sway=2.0, seen=0.1, seen_depth=0.15)
+#: Factors of the usual focal length that are tried where nobody told it, and how widely they are spread (log).
+_LENSES = (0.6, 0.7, 0.8, 0.9, 1.0, 1.15, 1.3, 1.5, 1.7)
+_LENS = 0.3
 Advance = Callable[[int], None]
 
 
@@ -245,10 +248,9 @@ def place_root(folder: Path, source: Path, scene: Scene, humanoid: HumanoidModel
     motion, touching = read_native(folder / "motion.npz"), touching_of(folder, scene)
     if not touching.any():
         raise InputError(source, "contacts", "no foot touches anything: say which frames do in the scene file")
-    moves = camera_moves(folder, scene) != "track"
-    root = _root(folder, motion, touching, humanoid, moves)
-    motion = _balanced(folder, motion, touching, root, humanoid)
-    root = _root(folder, motion, touching, humanoid, moves)
+    first = _root(folder, motion, touching, humanoid, None)
+    motion = _balanced(folder, motion, touching, first, humanoid)
+    root, focal = _seen_root(folder, motion, touching, humanoid, scene)
     floor = floor_height(root.supports, touched(scene, root.supports))
     qpos = motion.qpos.copy()
     qpos[:, :3] = root.positions - [0.0, 0.0, floor]
@@ -258,16 +260,38 @@ def place_root(folder: Path, source: Path, scene: Scene, humanoid: HumanoidModel
     rows = np.array([[s.foot, s.start, s.stop, s.height - floor] for s in root.supports])
     np.savez_compressed(out / "root.npz", supports=rows, flight=root.flight)
     save_projection(_projection(folder, body), out / "projection.npz")
+    (out / "lens.json").write_text(json.dumps({"focal_px": focal}))
 
 
 def _root(
-    folder: Path, motion: Motion, touching: NDArray[np.bool_], humanoid: HumanoidModel, seen: bool
+    folder: Path, motion: Motion, touching: NDArray[np.bool_], humanoid: HumanoidModel, seen: SeenPlaces | None
 ) -> KinematicRoot:
-    """Of poses anywhere; ``seen`` whether pictures tell how the pelvis moves."""
+    """Of poses anywhere."""
     pelvis = motion.qpos[:, :3]
     feet = sole_points(humanoid, motion) - pelvis[:, None, None]
     com = reference_states(humanoid, motion)["com"].numpy() - pelvis
-    return kinematic_root(feet, touching, com, motion.fps, _ROOT, _seen_steps(folder, motion) if seen else None)
+    return kinematic_root(feet, touching, com, motion.fps, _ROOT, seen)
+
+
+def _seen_root(
+    folder: Path, motion: Motion, touching: NDArray[np.bool_], humanoid: HumanoidModel, scene: Scene
+) -> tuple[KinematicRoot, float | None]:
+    """The root by feet, gravity and pictures, and the focal length (px) with which they go together best.
+
+    A camera that travels tells nothing: the root is by feet and gravity, and there is no focal length.
+    """
+    track = load_track(folder / "joints.npz")
+    size, pelvis = track.image_size, track.pixels[:, BODY_25.index("mid_hip")]
+    if size is None or camera_moves(folder, scene) == "track" or not np.isfinite(pelvis).any():
+        return _root(folder, motion, touching, humanoid, None), None
+    usual = focal_length(size, scene.camera.field_of_view)
+    factors = _LENSES if scene.camera.field_of_view is None else (1.0,)
+    found = []
+    for factor in factors:
+        root = _root(folder, motion, touching, humanoid, _seen_places(folder, motion, scene, factor * usual))
+        found.append((root.misfit + (np.log(factor) / _LENS) ** 2, factor, root))
+    _, factor, root = min(found, key=lambda one: one[0])
+    return root, factor * usual
 
 
 def _balanced(
@@ -283,18 +307,19 @@ def _balanced(
     return replace(motion, qpos=leaned(motion.qpos, lean(feet, stands, com, sight, motion.fps)))
 
 
-def _seen_steps(folder: Path, motion: Motion) -> SeenSteps | None:
-    """How the hips move across the line of sight, by their pixels once the camera is undone."""
+def _seen_places(folder: Path, motion: Motion, scene: Scene, focal: float) -> SeenPlaces:
+    """Where the hips are, by their pixels once the camera's turning is undone, and by their size in the picture."""
     track, camera = load_track(folder / "joints.npz"), clip_camera(folder)
-    to_world = read_arrays(folder / "orientation.npz", ("to_world",))["to_world"]
-    # Pixels a metre in the first picture: of the frame's own, and the zoom.
-    scale = np.linalg.norm(_projection(folder, motion).matrix[:, 0], axis=1) * camera.size()
-    hips = _held(track.pixels[:, BODY_25.index("mid_hip")])
-    if not np.isfinite(hips).all() or len(hips) < 2:
-        return None
-    axes = 0.5 * (to_world[1:] + to_world[:-1]).transpose(0, 2, 1)[:, :2]
-    axes /= np.linalg.norm(axes, axis=2, keepdims=True)
-    return SeenSteps(axes, np.diff(hips, axis=0) / np.sqrt(scale[1:] * scale[:-1])[:, None])
+    assert track.image_size is not None
+    pelvis = _held(camera.redo(track.pixels)[:, BODY_25.index("mid_hip")])
+    turns = view_turns(pelvis, camera, camera_moves(folder, scene), track.image_size, focal)
+    told = json.loads((folder / "fit.json").read_text())
+    to_world = first_to_world(told["pitch"], told["roll"]) @ turns
+    # Pixels a metre in the frame's own picture, whose focal length is the first one's and the zoom.
+    scale = np.linalg.norm(_projection(folder, motion).matrix[:, 0], axis=1)
+    depth = focal / (camera.size() * scale)
+    axes = to_world.transpose(0, 2, 1)
+    return SeenPlaces(depth[:, None] * axes[:, 2], axes, depth)
 
 
 def sole_points(humanoid: HumanoidModel, motion: Motion) -> Array:

@@ -13,7 +13,7 @@ from itertools import pairwise
 
 import numpy as np
 from scipy import sparse
-from scipy.ndimage import gaussian_filter1d
+from scipy.signal import savgol_filter
 
 from egopose.motion import rotations as rot
 from egopose.motion.rotations import Array
@@ -29,14 +29,14 @@ class BalanceSettings:
         depth: rad, of leans towards the camera and away from it.
         across: rad, of leans to the side in the picture, where poses are seen well.
         rate: rad/s, of a lean: a person's own leaning in a step is quicker.
-        smoothing: s, standard deviation in time, of the centre of mass before it is differentiated.
+        window: s, in which a cubic is fitted to the centre of mass's way to differentiate it (Savitzky & Golay 1964).
     """
 
     sole: float = 0.06
     depth: float = 0.25
     across: float = 0.05
     rate: float = 0.3
-    smoothing: float = 0.1
+    window: float = 0.3
 
 
 def lean(
@@ -90,12 +90,14 @@ def lean(
 def _carrying_point(away: Array, stands: np.ndarray, fps: float, settings: BalanceSettings) -> Array:
     """``[T, 2]`` m: c - (h / g) c'', where the same feet stand long enough to tell c''; c elsewhere."""
     out = away[:, :2].copy()
+    window = 2 * max(round(settings.window * fps / 2), 2) + 1
     same = np.flatnonzero(np.concatenate([[True], (stands[1:] != stands[:-1]).any(axis=1), [True]]))
     for start, stop in pairwise(same.tolist()):
-        if stop - start < 3 or not stands[start].any():
+        if stop - start < window or not stands[start].any():
             continue
-        smooth = gaussian_filter1d(away[start:stop, :2], settings.smoothing * fps, axis=0, mode="nearest")
-        bend = np.gradient(np.gradient(smooth, axis=0), axis=0) * fps**2
+        part = away[start:stop, :2]
+        smooth = savgol_filter(part, window, 3, axis=0)
+        bend = savgol_filter(part, window, 3, deriv=2, delta=1.0 / fps, axis=0)
         out[start:stop] = smooth - away[start:stop, 2:] / GRAVITY * bend
     return out
 

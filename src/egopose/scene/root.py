@@ -35,9 +35,11 @@ class RootSettings:
         landing: m/s^2, of that just before and after a flight: people land with ten times their weight.
         level: m: supports whose heights differ by less are one level, where one foot stands while the other lands.
         level_in_flight: m: likewise after a flight, whose height is known less well.
+        sole: m: that a standing sole's joints are off their support.
         lowness: m: of a foot's points, those that much higher than the lowest hardly count.
         ballistic: least share of a time without contact that take-off and landing speeds must tell of, to be a flight.
-        seen: m/s, of the pelvis's speed across the line of sight: a pixel at 100 pixels a metre and 30 frames/s is 0.3.
+        seen: m, of the pelvis's place across the line of sight: keypoints are off by 1 to 3 % of the body.
+        seen_depth: of its depth, in shares of the depth: so far is the person's size in the picture off.
         moving: m/s: both feet are seen to move faster through most of a flight.
         fall: least share of gravity by which the pelvis is seen to accelerate downwards in a flight.
         fall_frames: fewest steps from which that is told: a speed is known to 0.3 m/s in each.
@@ -51,9 +53,11 @@ class RootSettings:
     landing: float = 100.0
     level: float = 0.08
     level_in_flight: float = 0.15
+    sole: float = 0.01
     lowness: float = 0.02
     ballistic: float = 0.2
-    seen: float = 0.5
+    seen: float = 0.04
+    seen_depth: float = 0.04
     moving: float = 0.6
     fall: float = 0.5
     fall_frames: int = 8
@@ -71,24 +75,40 @@ class Support:
 
 @dataclass(frozen=True)
 class KinematicRoot:
-    """Args: ``positions [T, 3]`` m of the pelvis; ``supports`` in order of time; ``flight [T]`` who flies when."""
+    """Where the pelvis is.
+
+    Args:
+        positions: ``[T, 3]`` m of the pelvis.
+        supports: in order of time.
+        flight: ``[T]`` whether the body flies.
+        misfit: sum of the squared residuals: how ill feet, gravity and pictures go together.
+    """
 
     positions: Array
     supports: tuple[Support, ...]
     flight: NDArray[np.bool_]
+    misfit: float
 
 
 @dataclass(frozen=True)
-class SeenSteps:
-    """How pictures tell that the pelvis moves from each frame to the next.
+class SeenPlaces:
+    """Where pictures tell that the pelvis is, of a camera that stays in one place.
 
     Args:
-        axes: ``[T - 1, 2, 3]`` unit vectors in the world, across the line of sight.
-        steps: ``[T - 1, 2]`` m along them.
+        places: ``[T, 3]`` m, from the camera, in axes of the world.
+        axes: ``[T, 3, 3]`` unit vectors of the world: two across the line of sight, the last along it.
+        depth: ``[T]`` m, from the camera.
     """
 
+    places: Array
     axes: Array
-    steps: Array
+    depth: Array
+
+    def steps(self) -> tuple[Array, Array]:
+        """Across the line of sight, from each frame to the next: unit vectors ``[T - 1, 2, 3]``, m ``[T - 1, 2]``."""
+        axes = 0.5 * (self.axes[1:] + self.axes[:-1])[:, :2]
+        axes = axes / np.linalg.norm(axes, axis=2, keepdims=True)
+        return axes, np.einsum("tij,tj->ti", axes, np.diff(self.places, axis=0))
 
 
 def kinematic_root(
@@ -97,7 +117,7 @@ def kinematic_root(
     center_of_mass: Array,
     fps: float,
     settings: RootSettings | None = None,
-    seen: SeenSteps | None = None,
+    seen: SeenPlaces | None = None,
 ) -> KinematicRoot:
     """The pelvis's way through the world.
 
@@ -132,22 +152,24 @@ def kinematic_root(
     share /= share.sum(axis=2, keepdims=True)
     between = 0.5 * (share[1:] + share[:-1])
     steps = (np.diff(feet, axis=0) * (between / between.sum(axis=2, keepdims=True))[..., None]).sum(axis=2)
-    if seen is not None and (seen.axes.shape, seen.steps.shape) != ((len(feet) - 1, 2, 3), (len(feet) - 1, 2)):
-        raise ValueError(f"seen must be of {len(feet) - 1} steps: {list(seen.axes.shape)}, {list(seen.steps.shape)}")
+    if seen is not None and (seen.axes.shape, seen.places.shape) != ((len(feet), 3, 3), (len(feet), 3)):
+        raise ValueError(f"seen must be of {len(feet)} frames: {list(seen.axes.shape)}, {list(seen.places.shape)}")
     moving = _moving(steps, seen, fps, settings)
     firmness, flight = _firmness(contacts, feet, steps, center_of_mass, moving, seen, fps, settings)
-    positions = _least_squares(steps, firmness, flight, center_of_mass, seen, fps, settings)
+    positions, camera, misfit = _least_squares(steps, firmness, flight, center_of_mass, seen, fps, settings)
     lowest = positions[:, None, 2] + feet[..., 2].min(axis=2)
     supports = _levelled(lowest, contacts, settings)
-    positions = _on_supports(positions, lowest, supports, flight, center_of_mass, fps, settings)
-    return KinematicRoot(positions - [*positions[0, :2], 0.0], supports, flight)
+    rows = None if seen is None else _seen_heights(seen, positions, camera, settings)
+    positions = _on_supports(positions, lowest, supports, flight, center_of_mass, rows, fps, settings)
+    return KinematicRoot(positions - [*positions[0, :2], 0.0], supports, flight, misfit)
 
 
-def _moving(steps: Array, seen: SeenSteps | None, fps: float, settings: RootSettings) -> NDArray[np.bool_]:
+def _moving(steps: Array, seen: SeenPlaces | None, fps: float, settings: RootSettings) -> NDArray[np.bool_]:
     """``[T - 1]`` steps in which every foot is seen to move; ``steps [T - 1, F, 3]`` m are the feet's."""
     if seen is None:
         return np.zeros(len(steps), dtype=bool)
-    across = seen.steps[:, None] + np.einsum("tij,tfj->tfi", seen.axes, steps)
+    axes, told = seen.steps()
+    across = told[:, None] + np.einsum("tij,tfj->tfi", axes, steps)
     return np.asarray((np.linalg.norm(across, axis=2) * fps > settings.moving).all(axis=1))
 
 
@@ -157,7 +179,7 @@ def _firmness(
     steps: Array,
     center_of_mass: Array,
     moving: NDArray[np.bool_],
-    seen: SeenSteps | None,
+    seen: SeenPlaces | None,
     fps: float,
     settings: RootSettings,
 ) -> tuple[Array, NDArray[np.bool_]]:
@@ -194,7 +216,7 @@ def _firmness(
 
 
 def _seen_to_fly(
-    seen: SeenSteps | None, start: int, stop: int, fps: float, moving: NDArray[np.bool_], settings: RootSettings
+    seen: SeenPlaces | None, start: int, stop: int, fps: float, moving: NDArray[np.bool_], settings: RootSettings
 ) -> bool:
     """Whether pictures show a flight in frames ``start .. stop - 1``: both feet move, and the pelvis falls freely.
 
@@ -202,7 +224,8 @@ def _seen_to_fly(
     """
     if seen is None or np.mean(moving[max(start - 1, 0) : stop]) <= 0.5:
         return False
-    axes, speeds = seen.axes[start : stop - 1, :, 2], seen.steps[start : stop - 1] * fps
+    all_axes, told = seen.steps()
+    axes, speeds = all_axes[start : stop - 1, :, 2], told[start : stop - 1] * fps
     if len(axes) < settings.fall_frames:
         return True
     # The picture's own axis that is nearest to the vertical tells most.
@@ -225,14 +248,17 @@ def _least_squares(
     firmness: Array,
     flight: NDArray[np.bool_],
     center_of_mass: Array,
-    seen: SeenSteps | None,
+    seen: SeenPlaces | None,
     fps: float,
     settings: RootSettings,
-) -> Array:
-    """``[T, 3]`` m: the pelvis, from 0 on: standing feet slip least, and flights are nearest to gravity's."""
+) -> tuple[Array, Array, float]:
+    """The pelvis ``[T, 3]`` m, from 0 on: standing feet slip least, and flights are nearest to gravity's.
+
+    Also the camera's place ``[3]``, empty where pictures tell nothing, and the sum of the squared residuals.
+    """
     frames = len(firmness)
     if frames < 2:
-        return np.zeros((frames, 3))
+        return np.zeros((frames, 3)), np.zeros(3), 0.0
     change = sparse.eye_array(frames, k=1, format="csr")[: frames - 1] - sparse.eye_array(frames, format="csr")[:-1]
     rows, values = [sparse.eye_array(frames, format="csr")[:1]], [np.zeros((1, 3))]
     for foot in range(firmness.shape[1]):
@@ -244,12 +270,35 @@ def _least_squares(
     matrix = sparse.kron(sparse.vstack([*rows, bend]), sparse.eye_array(3), format="csr")
     right = np.concatenate([*values, target]).ravel()
     if seen is not None:
-        along = sparse.block_diag(list(seen.axes * fps / settings.seen), format="csr")
-        matrix = sparse.vstack([matrix, along @ sparse.kron(change, sparse.eye_array(3), format="csr")])
-        right = np.concatenate([right, seen.steps.ravel() * fps / settings.seen])
-    normal = (matrix.T @ matrix + 1e-9 * sparse.eye_array(3 * frames)).tocsc()
-    out: Array = sparse.linalg.spsolve(normal, matrix.T @ right).reshape(frames, 3)
-    return out
+        about, told = _seen_rows(seen, settings)
+        room = sparse.csr_array((matrix.shape[0], about.shape[1] - matrix.shape[1]))
+        matrix = sparse.vstack([sparse.hstack([matrix, room]), about], format="csr")
+        right = np.concatenate([right, told])
+    normal = (matrix.T @ matrix + 1e-9 * sparse.eye_array(matrix.shape[1])).tocsc()
+    out = sparse.linalg.spsolve(normal, matrix.T @ right)
+    misfit = float(((matrix @ out - right) ** 2).sum())
+    return out[: 3 * frames].reshape(frames, 3), out[3 * frames :], misfit
+
+
+def _seen_rows(seen: SeenPlaces, settings: RootSettings) -> tuple[sparse.csr_array, Array]:
+    """Rows and values of what pictures tell; three more unknowns come last: the camera's place."""
+    axes, value = _seen_scaled(seen, settings)
+    rows = sparse.hstack([sparse.block_diag(list(axes)), -sparse.csr_array(axes.reshape(-1, 3))], format="csr")
+    return rows, value.ravel()
+
+
+def _seen_scaled(seen: SeenPlaces, settings: RootSettings) -> tuple[Array, Array]:
+    """Axes ``[T, 3, 3]`` over the scales of their residuals, and the places ``[T, 3]`` along them."""
+    scale = np.column_stack([np.full((len(seen.depth), 2), settings.seen), settings.seen_depth * seen.depth])
+    axes = seen.axes / scale[:, :, None]
+    return axes, np.einsum("tij,tj->ti", axes, seen.places)
+
+
+def _seen_heights(seen: SeenPlaces, positions: Array, camera: Array, settings: RootSettings) -> tuple[Array, Array]:
+    """What pictures tell of the heights where ``positions [T, 3]`` are right along the floor: factors and values."""
+    axes, value = _seen_scaled(seen, settings)
+    value = value + np.einsum("tij,j->ti", axes, camera)
+    return axes[:, :, 2], value - np.einsum("tij,tj->ti", axes[:, :, :2], positions[:, :2])
 
 
 def _bending(
@@ -299,6 +348,7 @@ def _on_supports(
     supports: tuple[Support, ...],
     flight: NDArray[np.bool_],
     center_of_mass: Array,
+    seen: tuple[Array, Array] | None,
     fps: float,
     settings: RootSettings,
 ) -> Array:
@@ -310,11 +360,15 @@ def _on_supports(
         weight[span] += 1.0
         wanted[span] += support.height - (lowest[span, support.foot] - positions[span, 2])
     bend, target = _bending(flight, center_of_mass, fps, settings)
-    stand = weight / (0.01**2)  # a centimetre: what a sole's joints are wrong by
-    normal = (bend.T @ bend + sparse.diags_array(stand) + 1e-9 * sparse.eye_array(frames)).tocsc()
+    stand = weight / settings.sole**2
+    normal = bend.T @ bend + sparse.diags_array(stand) + 1e-9 * sparse.eye_array(frames)
     right = bend.T @ target[:, 2] + stand * wanted / np.maximum(weight, 1.0)
+    if seen is not None:
+        factor, value = seen
+        normal = normal + sparse.diags_array((factor**2).sum(axis=1))
+        right = right + (factor * value).sum(axis=1)
     out = positions.copy()
-    out[:, 2] = sparse.linalg.spsolve(normal, right)
+    out[:, 2] = sparse.linalg.spsolve(normal.tocsc(), right)
     return out
 
 
