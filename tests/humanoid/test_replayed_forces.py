@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import mujoco
 import numpy as np
@@ -16,7 +17,11 @@ from egopose.humanoid.physics import BatchedPhysics
 from egopose.humanoid.replayed_forces import ReplayedForces, replay_forces, window, with_replayed_forces
 from egopose.motion.motion import Motion
 from egopose.scene.clip import humanoid_in
-from egopose.scene.simulated import SimulatedMotion
+from egopose.scene.scene_file import read_scene
+from egopose.scene.simulated import SimulatedMotion, load_simulated
+
+#: Simulated motion capture among boxes, which ships with the project.
+CLIPS = Path(__file__).resolve().parents[2] / "experiments" / "scene_bench" / "clips"
 
 
 @pytest.fixture(scope="module")
@@ -175,3 +180,15 @@ def test_windows_cover_every_step_of_physics(substeps: int, frames: int) -> None
         seen[part] += 1
     assert (seen >= 1).all()
     assert (seen <= (2 if substeps == 1 else 1)).all()
+
+
+@pytest.mark.parametrize("name", ["jump_down", "steps_up", "walk_turn"])
+def test_mocap_among_boxes_comes_back_and_weighs_its_weight(name: str) -> None:
+    """Clips made by another program's controls: every control step leads to the saved state."""
+    motion, scene = load_simulated(CLIPS / name / "truth.npz"), read_scene(CLIPS / name / "scene.yaml")
+    forces = replayed(humanoid_in(scene, bare()), motion)
+    assert forces.drift < 1e-5
+    # Between two moments of like upward speed the mean force is the weight.
+    up = forces.force[..., 2].sum(axis=(1, 2)).mean()
+    gained = forces.mass * (forces.com_velocity[-1, 2] - forces.com_velocity[0, 2]) / (len(forces) / forces.rate)
+    assert up - gained == pytest.approx(forces.weight, rel=0.02)

@@ -12,7 +12,8 @@ from helpers.jump import UPRIGHT, bare, jumping, scene_at, standing
 from egopose.humanoid.replayed_forces import replay_forces
 from egopose.scene.clip import humanoid_in
 from egopose.scene.movement_numbers import MovementNumbers, movement_numbers, standing_height, write_numbers_csv
-from egopose.scene.simulated import SimulatedMotion
+from egopose.scene.scene_file import read_scene
+from egopose.scene.simulated import SimulatedMotion, load_simulated
 
 
 def numbers_of(motion: SimulatedMotion, height: float = 0.3) -> MovementNumbers:
@@ -88,3 +89,16 @@ def test_the_table_is_read_back(jump: MovementNumbers, tmp_path: Path) -> None:
         [row.value for row in rows if np.isfinite(row.value)], rel=1e-6
     )
     assert {row["unit"] for row in read} >= {"kg", "BW", "m", "s", "deg", "N m", "%"}
+
+
+def test_a_walk_of_motion_capture_has_a_persons_steps() -> None:
+    """CMU's walk: adults take 100 to 120 steps a minute of 0.6 to 0.8 m (Winter 2009)."""
+    folder = Path(__file__).resolve().parents[2] / "experiments" / "scene_bench" / "clips" / "walk_turn"
+    motion, humanoid = load_simulated(folder / "truth.npz"), humanoid_in(read_scene(folder / "scene.yaml"), bare())
+    forces = replay_forces(humanoid, motion.qpos, motion.qvel, motion.ctrl, motion.box_tops, motion.box_headings)
+    numbers = movement_numbers(humanoid, forces, motion.box_tops)
+    assert numbers.flights == ()
+    assert 85 < numbers.cadence < 125
+    assert len(numbers.steps) >= 5
+    assert all(0.55 < step.length < 0.85 for step in numbers.steps)
+    assert [step.side for step in numbers.steps[:4]] in (["left", "right"] * 2, ["right", "left"] * 2)

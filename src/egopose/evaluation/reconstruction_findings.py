@@ -1,4 +1,4 @@
-"""How well a reconstruction did: contacts wanted and found, sliding and sinking feet, and where it fails."""
+"""How well a reconstruction did: contacts wanted and found, feet that slide or sink, and where it fails."""
 
 from __future__ import annotations
 
@@ -10,14 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from egopose.evaluation.position_metrics import foot_slide
-from egopose.humanoid.foot_geometry import sole_positions
 from egopose.humanoid.surface_contacts import depths
 from egopose.inference.reconstruction import Reconstruction
+from egopose.inference.scene_stages import sole_points
 from egopose.motion.contacts import runs_of
 from egopose.motion.motion import Motion
 from egopose.motion.rotations import Array
 from egopose.scene.clip import BODIES, box_poses, wanted_contacts
-from egopose.scene.contacts import FEET
 from egopose.scene.scene_file import FLOOR
 
 #: Frames: what lasts a shorter time is not told; contacts of a film are off by so much.
@@ -114,11 +113,7 @@ class Findings:
         return np.asarray(np.nan_to_num(found).max(axis=(1, 2)))
 
     def _soundness(self, motion: Motion, depth: Array) -> Soundness:
-        humanoid = self.found.humanoid
-        names = [humanoid.skeleton.names[foot] for foot in humanoid.feet]
-        order = [names.index(BODIES[f"{side}_foot"]) for side in FEET]
-        soles = sole_positions(humanoid, motion).reshape(len(motion), len(names), -1, 3)[:, order]
-        slide = foot_slide(soles, self.found.clip.touching, motion.fps)
+        slide = foot_slide(sole_points(self.found.humanoid, motion), self.found.clip.touching, motion.fps)
         return Soundness(slide, float(depth.max()), float(depth.mean()), float((depth > _DEEP).mean()))
 
     def failures(self) -> list[str]:
