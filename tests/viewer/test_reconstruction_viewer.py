@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -110,6 +111,22 @@ def test_what_does_not_fit_is_told(tmp_path: Path) -> None:
     write_native(replace(longer, contacts=contacts, contact_names=body.contact_names), folder / "body.npz")
     with pytest.raises(InputError, match="61 frames; the clip has 62"):
         open_viewer([str(folder)], None, 0.0, "127.0.0.1", 0, TOKEN)
+
+
+def test_in_a_browser_it_loads_and_scrubs(viewer: ReconstructionViewer, page: Any) -> None:
+    faults: list[str] = []
+    page.on("pageerror", lambda error: faults.append(str(error)))
+    page.goto(viewer.url)
+    page.wait_for_selector("canvas")
+    page.wait_for_selector("text=/^frame 0 of 61/")
+    frame = page.locator("input.mantine-NumberInput-input").first
+    frame.click()
+    page.keyboard.press("Control+A")
+    page.keyboard.type(str(IN_AIR))
+    page.wait_for_selector(f"text=/^frame {IN_AIR} of 61/")
+    for text in ("The film", "should touch", "Vertical force of the ground, body weights", "Height of the root, m"):
+        page.get_by_text(text, exact=True).first.wait_for()
+    assert not faults
 
 
 @given(
