@@ -105,6 +105,25 @@ def test_the_plan_itself_and_the_kinematic_part(folder: Path, tmp_path: Path) ->
     assert (folder / "plan.npz").read_bytes() == before
 
 
+def test_every_step_of_physics_has_its_own_forces(folder: Path, found: Reconstruction, tmp_path: Path) -> None:
+    config = compose_config("export")
+    run_export(folder, [str(tmp_path / "fine.npz")], {**config, "rate": "physics"})
+    fine = read_motion(tmp_path / "fine.npz")
+    assert fine.fps == pytest.approx(120.0)
+    assert len(fine) == 4 * (len(jumping()) - 1)
+    np.testing.assert_array_equal(fine.qpos[::4], jumping().qpos[:-1])
+    ground = fine.ground_reaction
+    assert ground is not None
+    total = ground.force.sum(axis=1)
+    np.testing.assert_allclose(total, found.forces.force.sum(axis=(1, 2)))
+    assert total[:, 2].max() / found.forces.weight == pytest.approx(found.numbers.hardest)
+    assert fine.torques is not None
+    np.testing.assert_array_equal(fine.torques, found.forces.torques)
+    with pytest.raises(InputError, match="control or physics") as caught:
+        run_export(folder, [str(tmp_path / "fine.npz")], {**config, "rate": "fast"})
+    assert caught.value.field == "rate"
+
+
 def test_numbers_of_another_source_are_refused(folder: Path, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="needs a reconstruction"):
         run_export(folder / "body.npz", [str(tmp_path / "x.numbers.csv")], compose_config("export"))

@@ -6,6 +6,7 @@ Nothing is estimated here. Every control step starts from the saved state with a
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import mujoco
@@ -164,9 +165,32 @@ def with_replayed_forces(motion: Motion, humanoid: HumanoidModel, forces: Replay
         forces: of its replay.
     """
     touching = forces.any_at_frame(np.any(forces.touching, axis=2))
+    return _carrying(motion, humanoid, forces, touching, forces.per_frame)
+
+
+def every_step(humanoid: HumanoidModel, forces: ReplayedForces, name: str) -> Motion:
+    """The simulated motion at every step of physics, ``[N]`` frames, each with the forces that act in that step.
+
+    Args:
+        humanoid: that was simulated.
+        forces: of its replay.
+        name: of the motion.
+    """
+    motion = Motion(humanoid.skeleton, forces.qpos, forces.rate, name=name)
+    return _carrying(motion, humanoid, forces, np.any(forces.touching, axis=2), lambda values: values)
+
+
+def _carrying(
+    motion: Motion,
+    humanoid: HumanoidModel,
+    forces: ReplayedForces,
+    touching: NDArray[np.bool_],
+    at: Callable[[Array], Array],
+) -> Motion:
+    """``touching [T, B]``; ``at`` takes what is known of every step, ``[N, ...]``, to the motion's frames."""
     kept = np.union1d(humanoid.feet, np.flatnonzero(touching.any(axis=0)))
     summed = {name: getattr(forces, name)[:, kept].sum(axis=2) for name in ("force", "moment", "normal", "pressure")}
-    mean = {name: forces.per_frame(values) for name, values in summed.items()}
+    mean = {name: at(values) for name, values in summed.items()}
     pushed = mean["normal"] > 0
     own = motion.forward_kinematics()[0][:, kept] * [1.0, 1.0, 0.0]
     centre = mean["pressure"] / np.where(pushed, mean["normal"], 1.0)[..., None]
@@ -175,7 +199,7 @@ def with_replayed_forces(motion: Motion, humanoid: HumanoidModel, forces: Replay
     moment = np.where(pushed[..., None], mean["moment"] - np.cross(point, mean["force"]), 0.0)
     return replace(
         motion,
-        torques=forces.per_frame(forces.torques),
+        torques=at(forces.torques),
         ground_reaction=GroundReaction(names, mean["force"], point, moment),
         contacts=touching[:, kept],
         contact_names=names,

@@ -20,6 +20,7 @@ from egopose.core.safe_io import read_json
 from egopose.data.preparation import humanoid_of
 from egopose.humanoid.inverse_dynamics import ForceSettings, with_forces
 from egopose.humanoid.model import HumanoidModel
+from egopose.humanoid.replayed_forces import every_step
 from egopose.inference.reconstruction import (
     PLAN,
     Reconstruction,
@@ -98,7 +99,11 @@ def _motions(
 ) -> Iterator[tuple[str, Path, Motion]]:
     """Name, file and motion of every take."""
     if found is not None and config["part"] == "estimate":
-        yield found.folder.resolve().name, found.folder / PLAN, found.motion
+        if config["rate"] not in ("control", "physics"):
+            raise InputError(_SOURCE, "rate", f"must be control or physics, not {config['rate']!r}")
+        stepwise = config["rate"] == "physics"
+        motion = every_step(found.humanoid, found.forces, found.motion.name) if stepwise else found.motion
+        yield found.folder.resolve().name, found.folder / PLAN, motion
         return
     if found is not None:
         files_of = {found.folder.resolve().name: found.folder / "body.npz"}
