@@ -117,24 +117,25 @@ class Findings:
         return Soundness(slide, float(depth.max()), float(depth.mean()), float((depth > _DEEP).mean()))
 
     def failures(self) -> list[str]:
-        """Where it does not do what the film shows or what a body does, a sentence each; empty where nothing is."""
-        return [*self._missing(), *self._fallen(), *self._beyond(), *self._away(), *self._sunk()]
+        """Where it does not do what the film shows or what a body does, a sentence each, in the order of time."""
+        told = [*self._missing(), *self._fallen(), *self._beyond(), *self._away(), *self._sunk()]
+        return [sentence for _, sentence in sorted(told, key=lambda one: one[0])]
 
-    def _missing(self) -> Iterator[str]:
+    def _missing(self) -> Iterator[tuple[int, str]]:
         for one in self.contacts:
             for first, stop in _spans(one.wanted & ~one.found):
                 missing = f"the {_plain(one.effector)} should touch {_named(one.surface)}"
-                yield f"{_said(first, stop)}: {missing} and does not."
+                yield first, f"{_said(first, stop)}: {missing} and does not."
 
-    def _beyond(self) -> Iterator[str]:
+    def _beyond(self) -> Iterator[tuple[int, str]]:
         anywhere = {e: np.any([c.wanted for c in self.contacts if c.effector == e], axis=0) for e in BODIES}
         for one in self.contacts:
             for first, stop in _spans(one.found & ~one.wanted):
                 instead = ", instead of what it should touch" if anywhere[one.effector][first:stop].all() else ""
                 touches = f"the {_plain(one.effector)} touches {_named(one.surface)}{instead}"
-                yield f"{_said(first, stop)}: {touches}; the scene does not say so."
+                yield first, f"{_said(first, stop)}: {touches}; the scene does not say so."
 
-    def _fallen(self) -> Iterator[str]:
+    def _fallen(self) -> Iterator[tuple[int, str]]:
         names = self.found.humanoid.skeleton.names
         others = [row for row, name in enumerate(names) if name not in BODIES.values()]
         for column, surface in enumerate(self.surfaces):
@@ -142,17 +143,17 @@ class Findings:
             for first, stop in runs_of(np.any(touched, axis=1)):
                 bodies = [names[others[k]] for k in np.flatnonzero(touched[first:stop].any(axis=0))]
                 lying = f"{', '.join(bodies)} on {_named(surface)}"
-                yield f"{_said(first, stop)}: {lying}: only feet and hands should touch."
+                yield first, f"{_said(first, stop)}: {lying}: only feet and hands should touch."
 
-    def _away(self) -> Iterator[str]:
+    def _away(self) -> Iterator[tuple[int, str]]:
         for first, stop in _spans(self.root_distance > _FAR):
             most = self.root_distance[first:stop].max()
-            yield f"{_said(first, stop)}: the root is up to {most:.2f} m from the way read off the film."
+            yield first, f"{_said(first, stop)}: the root is up to {most:.2f} m from the way read off the film."
 
-    def _sunk(self) -> Iterator[str]:
+    def _sunk(self) -> Iterator[tuple[int, str]]:
         for first, stop in _spans(self.depth > _DEEP):
             most = 1e3 * self.depth[first:stop].max()
-            yield f"{_said(first, stop)}: the body reaches up to {most:.0f} mm into the ground."
+            yield first, f"{_said(first, stop)}: the body reaches up to {most:.0f} mm into the ground."
 
 
 def _spans(flags: NDArray[np.bool_]) -> list[tuple[int, int]]:

@@ -79,7 +79,8 @@ def read_reconstruction(folder: Path, humanoid: HumanoidModel) -> Reconstruction
             among, simulated.qpos, simulated.qvel, simulated.ctrl, simulated.box_tops, simulated.box_headings
         )
     except ValueError as error:
-        raise InputError(folder / PLAN, "ctrl", str(error)) from None
+        cause = f"{error}. Was the scene changed after it was made? Then reconstruct again"
+        raise InputError(folder / PLAN, "ctrl", cause) from None
     name = clip.body.name or folder.resolve().name
     bare = Motion(humanoid.skeleton, simulated.qpos, 1.0 / humanoid.control_dt, name=name)
     numbers = movement_numbers(among, forces, simulated.box_tops)
