@@ -37,24 +37,35 @@ def bare() -> HumanoidModel:
 def simulated(scene: Scene, root: tuple[float, float, float], bends: list[float], lean: float = 0.0) -> SimulatedMotion:
     """PD targets: hips and ankles bent by ``bends [T - 1]`` rad, knees by twice that; ``lean`` rad at the ankles."""
     humanoid = humanoid_in(scene, bare())
+    first = humanoid.mj_model.qpos0.copy()
+    first[:3] = root
+    targets = np.zeros((len(bends), humanoid.mj_model.nu))
+    for side in ("Right", "Left"):
+        for part, share in (("UpLeg", -1.0), ("Leg", 2.0), ("Foot", -1.0)):
+            column = humanoid.skeleton.dof_slices[humanoid.skeleton.index(side + part)].start
+            targets[:, column] = share * np.array(bends) - (lean if part == "Foot" else 0.0)
+    return _played(scene, first, targets)
+
+
+def thrown(scene: Scene, qpos: np.ndarray, up: float, frames: int) -> SimulatedMotion:
+    """From ``qpos [nq]`` upwards with ``up`` m/s, held straight."""
+    return _played(scene, qpos, np.zeros((frames - 1, bare().mj_model.nu)), up)
+
+
+def _played(scene: Scene, first: np.ndarray, targets: np.ndarray, up: float = 0.0) -> SimulatedMotion:
+    humanoid = humanoid_in(scene, bare())
     physics = BatchedPhysics(humanoid.mj_model, 1, humanoid.substeps, body_ids=humanoid.body_ids)
     tops, headings = box_poses(scene)
     physics.place_boxes(slice(None), tops[None], headings[None])
-    first = humanoid.mj_model.qpos0.copy()
-    first[:3] = root
-    physics.set_state(slice(None), first[None], np.zeros((1, humanoid.mj_model.nv)))
-    states, targets = [(physics.qpos[0].copy(), physics.qvel[0].copy())], []
-    for bend in bends:
-        target = np.zeros(humanoid.mj_model.nu)
-        for side in ("Right", "Left"):
-            for part, share in (("UpLeg", -1.0), ("Leg", 2.0), ("Foot", -1.0)):
-                column = humanoid.skeleton.dof_slices[humanoid.skeleton.index(side + part)].start
-                target[column] = share * bend - (lean if part == "Foot" else 0.0)
+    speeds = np.zeros((1, humanoid.mj_model.nv))
+    speeds[0, 2] = up
+    physics.set_state(slice(None), first[None], speeds)
+    states = [(physics.qpos[0].copy(), physics.qvel[0].copy())]
+    for target in targets:
         physics.step(target[None])
         states.append((physics.qpos[0].copy(), physics.qvel[0].copy()))
-        targets.append(target)
     qpos, qvel = (np.stack(values) for values in zip(*states, strict=True))
-    return SimulatedMotion(qpos, qvel, np.stack(targets), tops, headings)
+    return SimulatedMotion(qpos, qvel, targets, tops, headings)
 
 
 @lru_cache

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.jump import UPRIGHT, bare, jumping, scene_at, standing
+from helpers.jump import UPRIGHT, bare, jumping, scene_at, standing, thrown
 
 from egopose.humanoid.replayed_forces import replay_forces
 from egopose.scene.clip import humanoid_in
@@ -36,6 +36,7 @@ def test_the_jump_is_a_flight_over_the_box(jump: MovementNumbers) -> None:
     # The root rises over its place when standing about as much as the centre of mass does.
     assert flight.rise_standing == pytest.approx(root.max() - 0.3 - UPRIGHT, abs=0.08)
     assert flight.distance < 0.3
+    assert jump.off_feet == (True,)
     (landing,) = jump.landings
     assert landing.begin == flight.end
     assert landing.peak > 1.5
@@ -89,6 +90,15 @@ def test_the_table_is_read_back(jump: MovementNumbers, tmp_path: Path) -> None:
         [row.value for row in rows if np.isfinite(row.value)], rel=1e-6
     )
     assert {row["unit"] for row in read} >= {"kg", "BW", "m", "s", "deg", "N m", "%"}
+
+
+def test_a_flight_off_the_back_is_no_jump() -> None:
+    lying = humanoid_in(scene_at(0.3), bare()).mj_model.qpos0.copy()
+    lying[:7] = [-3.0, 0.0, 0.1, np.sqrt(0.5), 0.0, -np.sqrt(0.5), 0.0]
+    numbers = numbers_of(thrown(scene_at(0.3), lying, 2.0, 30))
+    assert numbers.off_feet == (False,)
+    assert numbers.flights[0].time == pytest.approx(2 * 2.0 / 9.81, rel=0.15)
+    assert any(row.what == "flight 1, not off the feet: time" for row in numbers.rows())
 
 
 def test_a_walk_of_motion_capture_has_a_persons_steps() -> None:

@@ -20,6 +20,7 @@ from egopose.core.errors import InputError
 from egopose.motion import rotations as rot
 from egopose.motion.io.native import read_native, write_native
 from egopose.scene.projection import Projection, camera_poses
+from egopose.view import command_line
 from egopose.viewer.reconstruction_app import ReconstructionViewer
 from egopose.viewer.scene_app import SceneViewer
 from egopose.viewer.session import open_viewer
@@ -93,6 +94,7 @@ def test_both_bodies_are_drawn_over_the_film(viewer: ReconstructionViewer) -> No
 
 
 def test_the_scene_can_still_be_changed(folder: Path) -> None:
+    assert command_line().parse_args([str(folder), "--scene"]).scene
     shown = open_viewer([str(folder)], None, 0.0, "127.0.0.1", 0, TOKEN, scene=True)
     try:
         assert isinstance(shown, SceneViewer)

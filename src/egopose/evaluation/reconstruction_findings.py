@@ -17,6 +17,7 @@ from egopose.motion.contacts import runs_of
 from egopose.motion.motion import Motion
 from egopose.motion.rotations import Array
 from egopose.scene.clip import BODIES, box_poses, wanted_contacts
+from egopose.scene.contacts import FEET
 from egopose.scene.scene_file import FLOOR
 
 #: Frames: what lasts a shorter time is not told; contacts of a film are off by so much.
@@ -40,7 +41,7 @@ class Soundness:
     """What a motion does that no body does.
 
     Args:
-        slide: m/s, see :func:`egopose.evaluation.position_metrics.foot_slide`, while the film says that feet touch.
+        slide: m/s, see :func:`egopose.evaluation.position_metrics.foot_slide`, while the clip says that feet touch.
         deepest: m, the most that it reaches into the floor or a box.
         depth: m, the mean over frames of the most in each.
         sunk: share of frames in which it reaches deeper than 2 cm.
@@ -106,6 +107,14 @@ class Findings:
     @cached_property
     def kinematic(self) -> Soundness:
         return self._soundness(self.found.clip.body, self._depth(self.found.clip.body, simulated=False))
+
+    @cached_property
+    def own_slide(self) -> float:
+        """m/s: how fast the simulated feet slide while they touch something in the simulation."""
+        feet = [self.found.humanoid.skeleton.index(BODIES[f"{side}_foot"]) for side in FEET]
+        touching = np.any(self.touching[:, feet], axis=2)
+        motion = self.found.motion
+        return foot_slide(sole_points(self.found.humanoid, motion), touching, motion.fps)
 
     def _depth(self, motion: Motion, *, simulated: bool) -> Array:
         scene = self.found.scene if simulated else self.found.clip.scene

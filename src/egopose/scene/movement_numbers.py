@@ -77,6 +77,7 @@ class MovementNumbers:
 
     Args:
         flights, landings: one landing a flight.
+        off_feet: of each flight, whether nothing but the feet touched just before it.
         contacts: of both feet.
         steps: strikes of one foot after the other.
         joints: hips, knees, ankles of both sides.
@@ -90,6 +91,7 @@ class MovementNumbers:
 
     flights: tuple[Flight, ...]
     landings: tuple[Landing, ...]
+    off_feet: tuple[bool, ...]
     contacts: tuple[FootContact, ...]
     steps: tuple[Step, ...]
     joints: tuple[JointFigures, ...]
@@ -128,8 +130,9 @@ class MovementNumbers:
         yield self._row("peak vertical ground reaction, one step of physics", "", self.hardest, "BW", 0, last)
 
     def _flights(self) -> Iterator[Row]:
-        for number, (flight, landing) in enumerate(zip(self.flights, self.landings, strict=True), start=1):
-            span, name = (flight.begin, flight.end), f"flight {number}: "
+        of_each = zip(self.flights, self.landings, self.off_feet, strict=True)
+        for number, (flight, landing, off_feet) in enumerate(of_each, start=1):
+            span, name = (flight.begin, flight.end), f"flight {number}{'' if off_feet else ', not off the feet'}: "
             yield self._row(f"{name}time", "", flight.time, "s", *span)
             yield self._row(f"{name}rise of the centre of mass from take-off", "", flight.rise, "m", *span)
             yield self._row(f"{name}rise of the centre of mass from standing", "", flight.rise_standing, "m", *span)
@@ -208,10 +211,12 @@ def movement_numbers(humanoid: HumanoidModel, forces: ReplayedForces, box_tops: 
     air = flights(
         np.any(touching, axis=(1, 2)), forces.com, forces.com_velocity, standing, forces.rate, gravity=forces.gravity
     )
+    others = np.delete(np.any(touching, axis=2), feet, axis=1)
     contacts = foot_contacts(np.any(touching[:, feet], axis=2), upward[:, feet], forces.rate)
     return MovementNumbers(
         tuple(air),
         tuple(landings(air, vertical, forces.rate)),
+        tuple(not others[max(0, one.begin - forces.substeps) : one.begin].any() for one in air),
         tuple(contacts),
         tuple(steps(contacts, forces.places[:, feet], forces.com, air, forces.rate)),
         tuple(_joint_figures(humanoid, forces)),
