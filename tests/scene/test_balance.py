@@ -30,7 +30,7 @@ def moved(com: Array, turn: Array) -> Array:
 def test_a_body_that_leans_from_the_camera_is_set_up() -> None:
     feet, contacts, com, sight = standing(60, np.array([0.0, 0.3]))
     after = moved(com, lean(feet, contacts, com, sight, FPS))
-    assert np.abs(after[:, 1]).max() < 0.05
+    assert np.abs(after[:, 1]).max() < 0.12
 
 
 def test_depth_gives_way_before_the_picture() -> None:

@@ -28,7 +28,7 @@ from egopose.vision.video import probe_video
 COSTS = {"poses": 250.0, "camera": 40.0, "sides": 2.0, "contacts": 1.0, "joints": 1.0, "motion": 20.0, "root": 3.0}
 COSTS |= {"scene": 1.0, "page": 30.0}
 #: Changes with what the stages compute from the same inputs.
-_VERSION = 5
+_VERSION = 6
 _SCENE = "scene.yaml"
 
 
@@ -101,8 +101,8 @@ def prepare_scene(
         if not edited:
             run(
                 "scene",
-                {**of("body.npz", "root.npz", "fit.json"), "scene": repr(scene)},
-                lambda _, part: stages.fill_scene(folder, scene, humanoid, part),
+                {**of("body.npz", "root.npz", "fit.json"), "scene": repr(scene), "given": values["scene"] is not None},
+                lambda _, part: stages.fill_scene(folder, scene, values["scene"] is not None, humanoid, part),
             )
         run(
             "page",

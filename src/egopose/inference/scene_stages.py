@@ -22,7 +22,6 @@ from egopose.motion.io.native import read_native, write_native
 from egopose.motion.motion import Motion
 from egopose.motion.rotations import Array
 from egopose.scene.articulation import articulated
-from egopose.scene.balance import lean, leaned
 from egopose.scene.camera import CameraTrack, camera_motion
 from egopose.scene.camera_file import given_camera, load_camera, save_camera
 from egopose.scene.contacts import FEET, LOWER_BODY, ContactNetwork, estimate_contacts
@@ -37,7 +36,7 @@ from egopose.scene.poses.track import PoseTrack, load_track
 from egopose.scene.projection import Projection, fit_projection
 from egopose.scene.root import KinematicRoot, RootSettings, SeenPlaces, Support, kinematic_root
 from egopose.scene.scene_file import Scene, write_scene
-from egopose.scene.supports import filled_scene, floor_height, levels, told_contacts, touched
+from egopose.scene.supports import filled_scene, floor_height, levels, matched, told_contacts, touched
 from egopose.scene.upright import first_to_world, focal_length, orientation, view_turns
 from egopose.vision.video import Frame, iter_frames, probe_video
 
@@ -248,8 +247,6 @@ def place_root(folder: Path, source: Path, scene: Scene, humanoid: HumanoidModel
     motion, touching = read_native(folder / "motion.npz"), touching_of(folder, scene)
     if not touching.any():
         raise InputError(source, "contacts", "no foot touches anything: say which frames do in the scene file")
-    first = _root(folder, motion, touching, humanoid, None)
-    motion = _balanced(folder, motion, touching, first, humanoid)
     root, focal = _seen_root(folder, motion, touching, humanoid, scene)
     floor = floor_height(root.supports, touched(scene, root.supports))
     qpos = motion.qpos.copy()
@@ -292,19 +289,6 @@ def _seen_root(
         found.append((root.misfit + (np.log(factor) / _LENS) ** 2, factor, root))
     _, factor, root = min(found, key=lambda one: one[0])
     return root, factor * usual
-
-
-def _balanced(
-    folder: Path, motion: Motion, touching: NDArray[np.bool_], root: KinematicRoot, humanoid: HumanoidModel
-) -> Motion:
-    """The motion leaned so that its feet carry it."""
-    feet = sole_points(humanoid, motion).mean(axis=2)
-    com = reference_states(humanoid, motion)["com"].numpy()
-    # Where contacts were missed, the lower foot carries.
-    lower = np.arange(feet.shape[1]) == feet[..., 2].argmin(axis=1)[:, None]
-    stands = touching | (lower & ~touching.any(axis=1, keepdims=True) & ~root.flight[:, None])
-    sight = read_arrays(folder / "orientation.npz", ("to_world",))["to_world"][:, :, 2]
-    return replace(motion, qpos=leaned(motion.qpos, lean(feet, stands, com, sight, motion.fps)))
 
 
 def _seen_places(folder: Path, motion: Motion, scene: Scene, focal: float) -> SeenPlaces:
@@ -364,13 +348,15 @@ def trust_of(folder: Path) -> Array:
     return trust
 
 
-def fill_scene(folder: Path, scene: Scene, humanoid: HumanoidModel, out: Path) -> None:
-    """``scene.yaml``: the scene with what it left out."""
+def fill_scene(folder: Path, scene: Scene, given: bool, humanoid: HumanoidModel, out: Path) -> None:
+    """``scene.yaml``: the scene with what it left out. Boxes are proposed only where no scene was ``given``."""
     body, supports = read_native(folder / "body.npz"), supports_of(folder)
     soles = sole_points(humanoid, body).mean(axis=2)[..., :2]
     heading = body.qpos[:, 3:7]
     yaws = 2 * np.arctan2(heading[:, 3], heading[:, 0])
-    touches = touched(scene, supports)
+    touches: list[str | None] = touched(scene, supports)
+    if given:
+        touches = [*matched(scene, supports, touches, 0.0, soles)]
     on = levels(supports, touches, 0.0, soles, np.arctan2(np.sin(yaws), np.cos(yaws)))
     filled = filled_scene(scene, supports, touches, on)
     fit = json.loads((folder / "fit.json").read_text())

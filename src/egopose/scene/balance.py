@@ -1,23 +1,20 @@
 """A body that stands is in balance: how one camera's poses must be turned so that they could stand.
 
-One camera tells little about depth, so that lifted poses lean towards it or away from it by tenths of a radian. Physics
-knows better: where a foot stands, the point that carries the body lies under it. With the centre of mass at height h
-and c from the foot, it lies at c - (h / g) c'' (the linear inverted pendulum: Kajita et al. 2001). The lean is a slow
-turn of the whole body about its feet that brings this point under the feet. It is one linear least-squares problem.
+One camera tells little about depth, so that lifted poses lean towards it or away from it by tenths of a radian. Over
+some steps a body's centre of mass is above its feet. The lean is a slow turn of the whole body about its feet that
+brings it there. It is one linear least-squares problem. Where poses are right it takes away a little of a run's own
+leaning, so it is a second reference beside the poses as they are.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from itertools import pairwise
 
 import numpy as np
 from scipy import sparse
-from scipy.signal import savgol_filter
 
 from egopose.motion import rotations as rot
 from egopose.motion.rotations import Array
-from egopose.scene.root import GRAVITY
 
 
 @dataclass(frozen=True)
@@ -29,14 +26,12 @@ class BalanceSettings:
         depth: rad, of leans towards the camera and away from it.
         across: rad, of leans to the side in the picture, where poses are seen well.
         rate: rad/s, of a lean: a person's own leaning in a step is quicker.
-        window: s, in which a cubic is fitted to the centre of mass's way to differentiate it (Savitzky & Golay 1964).
     """
 
-    sole: float = 0.06
+    sole: float = 0.12
     depth: float = 0.25
     across: float = 0.05
-    rate: float = 0.3
-    window: float = 0.3
+    rate: float = 0.1
 
 
 def lean(
@@ -64,7 +59,6 @@ def lean(
     away = center_of_mass - carried
     # The feet's distance from their middle: between them the point may be anywhere.
     spread = np.where(stands, np.linalg.norm((feet - carried[:, None])[..., :2], axis=2), 0.0).max(axis=1)
-    point = _carrying_point(away, stands, fps, settings)
     weight = np.where(count > 0, 1.0 / (settings.sole + spread), 0.0)
     height = np.maximum(away[:, 2], 0.1)
     # A turn by (x, y) moves the centre of mass by h (y, -x).
@@ -73,7 +67,7 @@ def lean(
     # Moves of the centre of mass over its height: u (T, 2), in the world.
     eye = sparse.eye_array(frames, format="csr")
     rows = [sparse.kron(sparse.diags_array(weight * height), sparse.eye_array(2), format="csr")]
-    values = [(-point * weight[:, None]).ravel()]
+    values = [(-away[:, :2] * weight[:, None]).ravel()]
     for axis, scale in ((forward, settings.depth), (side, settings.across)):
         rows.append(sparse.block_diag(list(axis[:, None] / scale), format="csr"))
         values.append(np.zeros(frames))
@@ -85,21 +79,6 @@ def lean(
     normal = (matrix.T @ matrix).tocsc()
     moved = sparse.linalg.spsolve(normal, matrix.T @ np.concatenate(values)).reshape(frames, 2)
     return np.column_stack([-moved[:, 1], moved[:, 0], np.zeros(frames)])
-
-
-def _carrying_point(away: Array, stands: np.ndarray, fps: float, settings: BalanceSettings) -> Array:
-    """``[T, 2]`` m: c - (h / g) c'', where the same feet stand long enough to tell c''; c elsewhere."""
-    out = away[:, :2].copy()
-    window = 2 * max(round(settings.window * fps / 2), 2) + 1
-    same = np.flatnonzero(np.concatenate([[True], (stands[1:] != stands[:-1]).any(axis=1), [True]]))
-    for start, stop in pairwise(same.tolist()):
-        if stop - start < window or not stands[start].any():
-            continue
-        part = away[start:stop, :2]
-        smooth = savgol_filter(part, window, 3, axis=0)
-        bend = savgol_filter(part, window, 3, deriv=2, delta=1.0 / fps, axis=0)
-        out[start:stop] = smooth - away[start:stop, 2:] / GRAVITY * bend
-    return out
 
 
 def leaned(qpos: Array, turn: Array) -> Array:

@@ -18,6 +18,8 @@ from egopose.scene.scene_file import FLOOR, Box, Contact, Scene
 _STEP = 0.15
 #: m: supports on one box lie no further from the nearest of them, and no further from each other in height.
 _REACH, _ALIKE = 1.2, 0.25
+#: m: a foot this far beside a box counts as one that is wrong in height by as much as levels may differ.
+_BESIDE = 0.2
 #: m around the feet that stood on a box that nobody described, and its least side.
 _MARGIN, _LEAST_SIDE = 0.2, 0.5
 
@@ -87,6 +89,40 @@ def touched(scene: Scene, supports: Sequence[Support]) -> list[str | None]:
         }
         out.append(max(shared, key=lambda name: shared[name]) if shared else None)
     return out
+
+
+def matched(
+    scene: Scene, supports: Sequence[Support], touches: Sequence[str | None], floor: float, feet: Array
+) -> list[str]:
+    """What each support is on where a scene tells all boxes there are: one of them, or the floor.
+
+    A box counts as far away as its upper face is from where the foot stood, and as its height is from the support's.
+
+    Args:
+        scene: with its boxes; one without a place takes no support.
+        supports: of the kinematic root.
+        touches: of :func:`touched`: what is said stays.
+        floor: m, of :func:`floor_height`.
+        feet: ``[T, 2, 2]`` m, where the right and the left foot are.
+    """
+    out = []
+    for support, said in zip(supports, touches, strict=True):
+        height, place = support.height - floor, _place(support, feet)
+        away = {FLOOR: abs(height) / _STEP}
+        for box in scene.boxes:
+            if box.place is not None:
+                beside = float(np.linalg.norm(np.maximum(np.abs(_in_box(box, place)) - 0.5 * np.array(box.size), 0.0)))
+                off = 0.0 if box.height is None else abs(height - box.height)
+                away[box.name] = beside / _BESIDE + off / _ALIKE
+        out.append(said or min(away, key=lambda name: away[name]))
+    return out
+
+
+def _in_box(box: Box, place: Array) -> Array:
+    """``[2]`` m, in the box's own axes from the middle of its upper face."""
+    yaw = box.yaw or 0.0
+    ahead = np.array([np.cos(yaw), np.sin(yaw)])
+    return np.stack([ahead, [-ahead[1], ahead[0]]]) @ (place - np.array(box.place))
 
 
 def levels(
