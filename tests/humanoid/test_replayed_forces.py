@@ -170,6 +170,19 @@ def test_arrays_of_another_body_are_refused(humanoid: HumanoidModel) -> None:
         replay_forces(humanoid, motion.qpos, motion.qvel, motion.ctrl, motion.box_tops[:1], motion.box_headings[:1])
 
 
+@pytest.mark.parametrize(("name", "value"), [("qvel", 1e9), ("qpos", np.nan), ("ctrl", -1e5)])
+def test_absurd_values_are_refused_before_physics_sees_them(
+    humanoid: HumanoidModel, name: str, value: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    motion = standing()
+    arrays = {key: getattr(motion, key).copy() for key in ("qpos", "qvel", "ctrl")}
+    arrays[name][0, 8] = value
+    with pytest.raises(ValueError, match=f"{name} is not finite or absurdly large in frame 0"):
+        replay_forces(humanoid, **arrays, box_tops=motion.box_tops, box_headings=motion.box_headings)
+    assert not list(tmp_path.iterdir())
+
+
 @given(substeps=st.integers(1, 15), frames=st.integers(2, 40))
 def test_windows_cover_every_step_of_physics(substeps: int, frames: int) -> None:
     count = (frames - 1) * substeps

@@ -68,6 +68,18 @@ def test_what_does_not_fit_is_told(tmp_path: Path) -> None:
     assert caught.value.field == "ctrl"
 
 
+def test_a_plan_of_another_clip_is_told(tmp_path: Path) -> None:
+    write_folder(tmp_path, jumping(), scene_at(0.3))
+    motion = jumping()
+    shorter = replace(motion, qpos=motion.qpos[:-1], qvel=motion.qvel[:-1], ctrl=motion.ctrl[:-1])
+    shorter.save(tmp_path / "plan.npz")
+    with pytest.raises(InputError, match="60 frames; the clip has 61"):
+        read_reconstruction(tmp_path, bare())
+    (tmp_path / "plan.npz").write_bytes(b"PK no archive")
+    with pytest.raises(InputError):
+        read_reconstruction(tmp_path, bare())
+
+
 def test_all_formats_hold_the_simulations_forces(folder: Path, found: Reconstruction, tmp_path: Path) -> None:
     endings = (".bvh", ".npz", ".mot", ".forces.mot", ".torques.sto", ".glb", ".csv", ".c3d", ".numbers.csv")
     files = [str(tmp_path / "{take}") + ending for ending in endings]

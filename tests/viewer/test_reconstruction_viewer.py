@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,8 +16,8 @@ from hypothesis import strategies as st
 pytest.importorskip("viser", reason="viser is not installed: pip install 'egopose[view]'")
 
 from egopose.core.errors import InputError
+from egopose.inference.scene_stages import load_projection, save_projection
 from egopose.motion import rotations as rot
-from egopose.motion.io.native import read_native, write_native
 from egopose.scene.projection import Projection, camera_poses
 from egopose.view import command_line
 from egopose.viewer.reconstruction_app import ReconstructionViewer
@@ -106,12 +105,9 @@ def test_what_does_not_fit_is_told(tmp_path: Path) -> None:
     folder = write_folder(tmp_path, jumping(), scene_at(0.3))
     with pytest.raises(InputError, match="by itself"):
         open_viewer([str(folder), str(folder)], None, 0.0, "127.0.0.1", 0, TOKEN)
-    body = read_native(folder / "body.npz")
-    write_native(body.slice(0, 61), folder / "body.npz")
-    longer = replace(body, qpos=np.concatenate([body.qpos, body.qpos[-1:]]), contacts=None, contact_names=())
-    contacts = np.zeros((len(longer), 2), bool)
-    write_native(replace(longer, contacts=contacts, contact_names=body.contact_names), folder / "body.npz")
-    with pytest.raises(InputError, match="61 frames; the clip has 62"):
+    short = load_projection(folder / "projection.npz")
+    save_projection(Projection(short.matrix[1:], short.origin[1:]), folder / "projection.npz")
+    with pytest.raises(InputError, match="60 frames; the clip has 61"):
         open_viewer([str(folder)], None, 0.0, "127.0.0.1", 0, TOKEN)
 
 

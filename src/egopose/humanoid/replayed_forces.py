@@ -22,6 +22,8 @@ from egopose.motion.rotations import Array
 #: rad, m and their rates: a replay that ends further off was made with another body, other boxes or other physics.
 #: On one machine it is exact; another machine rounds otherwise, and each control step starts anew.
 _TOLERANCE = 1e-5
+#: m, m/s and rad/s: no simulated state is beyond it, see :class:`egopose.humanoid.physics.BatchedPhysics`.
+_ABSURD = 1e3
 
 
 @dataclass(frozen=True, eq=False)
@@ -213,6 +215,11 @@ def _check(humanoid: HumanoidModel, qpos: Array, qvel: Array, ctrl: Array) -> No
     for (name, shape), array in zip(wanted.items(), (qpos, qvel, ctrl), strict=True):
         if array.shape != shape or frames < 2:
             raise ValueError(f"{name} is {list(array.shape)}; {list(shape)} fits this body, with at least two frames")
+        # MuJoCo would write a file of warnings where the process stands.
+        if not np.abs(array).max() < _ABSURD:
+            raise ValueError(
+                f"{name} is not finite or absurdly large in frame {int(np.argmax(np.abs(array).max(axis=1)))}"
+            )
 
 
 class _Recorder:

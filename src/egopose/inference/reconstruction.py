@@ -67,12 +67,15 @@ def read_reconstruction(folder: Path, humanoid: HumanoidModel) -> Reconstruction
         humanoid: bare, at the rate of the simulation.
 
     Raises:
-        InputError: a file is missing or damaged, or the controls do not lead through the states.
+        InputError: a file is missing or damaged, the simulated motion is not of this clip, or its controls do not lead
+            through the states.
     """
     clip, simulated = read_clip(folder), load_simulated(folder / PLAN)
     if len(simulated.box_tops) != len(clip.scene.boxes):
         cause = f"there are {len(simulated.box_tops)}; scene.yaml has {len(clip.scene.boxes)}"
         raise InputError(folder / PLAN, "box_tops", cause)
+    if len(simulated) != len(clip):
+        raise InputError(folder / PLAN, "qpos", f"{len(simulated)} frames; the clip has {len(clip)}")
     among = humanoid_in(clip.scene, humanoid)
     try:
         forces = replay_forces(

@@ -54,8 +54,9 @@ class ReconstructionViewer(TimelineViewer):
     def __init__(self, folder: Path, humanoid: HumanoidModel, address: Address, video: Path | None = None) -> None:
         self._found = found = read_reconstruction(folder, humanoid)
         self._projection = load_projection(folder / "projection.npz")
-        if len(self._projection.origin) != len(found.motion) or len(found.clip) != len(found.motion):
-            raise InputError(folder / "plan.npz", "qpos", f"{len(found.motion)} frames; the clip has {len(found.clip)}")
+        if len(self._projection.origin) != len(found.motion):
+            cause = f"{len(self._projection.origin)} frames; the clip has {len(found.motion)}"
+            raise InputError(folder / "projection.npz", "origin", cause)
         self._film = film_of(folder) if video is None else video
         self._info: VideoInfo | None = None if self._film is None else probe_video(self._film)
         self._bodies = [
