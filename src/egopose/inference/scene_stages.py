@@ -167,6 +167,15 @@ def clip_of(folder: Path) -> tuple[int, int]:
     return int(card["start"]), int(card["stop"])
 
 
+def film_of(folder: Path) -> Path | None:
+    """Where the film was; None where there was none, or it is gone."""
+    try:
+        video = json.loads((folder / "clip.json").read_text()).get("video")
+    except (OSError, ValueError):
+        return None
+    return Path(video) if isinstance(video, str) and Path(video).is_file() else None
+
+
 def clip_camera(folder: Path) -> CameraTrack:
     """The camera over the clip's frames, still against the film's first picture."""
     camera, part = load_camera(folder / "camera.npz"), slice(*clip_of(folder))
