@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from egopose.checkpoint.checkpoint import find_checkpoint
+from egopose.checkpoint.pretrained import FOLDER
 from egopose.core.config import convert
 from egopose.core.stages import StageFolder
 from egopose.data.preparation import humanoid_of
@@ -48,7 +48,8 @@ def recover_scene(values: Mapping[str, Any], folder: Path, write_report: Callabl
         InputError: a setting, the policy or a file of the preparation cannot be used. Stages that were made stay.
     """
     settings = SamplingSettings.from_config(values["sampling"])
-    policy = load_policy(str(values["policy"]))
+    chosen = FOLDER / "tracker" if values["policy"] is None else Path(str(values["policy"]))
+    policy = load_policy(chosen)
     free = convert(values["fit"], bool, "conf/reconstruct.yaml", "fit")
     clip, humanoid, store = read_clip(folder), humanoid_of(values), StageFolder(folder)
     made_from = {name: store.digest(name) for name in ("body.npz", "root.npz", "joints.npz", "orientation.npz")}
@@ -57,7 +58,7 @@ def recover_scene(values: Mapping[str, Any], folder: Path, write_report: Callabl
         "scene": repr((clip.scene.boxes, clip.scene.contacts)),
         "sampling": values["sampling"],
         "fit": free,
-        "policy": _digest(find_checkpoint(str(values["policy"]))),
+        "policy": _digest(policy.path),
         "version": _VERSION,
     }
     with StageProgress(_COSTS, len(clip)) as progress:
