@@ -10,6 +10,7 @@ import pytest
 import yaml
 
 from egopose.core.verbs import VERBS
+from egopose.envs.mdp import scene_rewards
 from egopose.envs.mdp.rewards import TERMS
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -70,6 +71,7 @@ def test_the_docs_tell_of_every_choice_of_trainings_groups() -> None:
 def test_the_docs_tell_of_every_reward_term() -> None:
     page = (ROOT / "docs" / "howto-train.md").read_text()
     table = page.partition("| term | compares")[2].partition("\n\n")[0]
+    assert scene_rewards.clip_pose is TERMS["clip_pose"].function
     own = {name for name, term in TERMS.items() if term.function.__module__.startswith("egopose.")}
     assert set(re.findall(r"^\| `(\w+)` \|", table, re.MULTILINE)) == own
 

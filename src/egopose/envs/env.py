@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -52,6 +53,13 @@ def _step_parts(arrays: Mapping[str, Tensor]) -> dict[str, Any]:
     if "floor_contacts" in arrays:
         parts["contacts"] = Contacts(arrays["floor_contacts"], arrays["box_contacts"])
     return parts
+
+
+def _scene(body: Mapping[str, Tensor]) -> Tensor:
+    """``[n, K, 7]`` places and quaternions of the boxes; none where the worlds have none."""
+    if "box_tops" not in body:
+        return torch.zeros(len(body["qpos"]), 0, 7, dtype=torch.float64)
+    return torch.cat([body["box_tops"], body["box_quaternions"]], dim=-1)
 
 
 def _replaced(counter: Counter, rows: NDArray[np.integer] | slice, values: Counter) -> Counter:
@@ -151,6 +159,7 @@ class EgoPoseEnv(EnvBase):
         self.placed = torch.zeros(num_envs, humanoid.mj_model.nu, dtype=torch.float64)
         self._targets = torch.zeros(num_envs, humanoid.mj_model.nu, dtype=torch.float64)
         self.laid = torch.zeros(num_envs, 3, dtype=torch.float64)  # see egopose.envs.mdp.path
+        self.memory = torch.zeros(num_envs, problem.memory_size, dtype=torch.float64)
         self._unrewarded: list[_Unrewarded] | None = None
         self._earnings: list[Tensor] = []
         self._no_flags = _no_flags(problem.endings, self.batch_size)
@@ -262,13 +271,14 @@ class EgoPoseEnv(EnvBase):
         self._start = _replaced(self._start, rows, episodes.start.numpy())
         self._stop = _replaced(self._stop, rows, episodes.stop.numpy())
         self._frame = _replaced(self._frame, rows, episodes.start.numpy())
+        self.memory[worlds] = 0.0
         scene = self.problem.boxes(episodes.start, self._generator)
         if scene is not None:
             self.physics.place_boxes(rows, *(part.numpy() for part in scene))
         if state:
             self.place(worlds, *state)
         else:
-            self._put(worlds, *self.problem.first_state(episodes.start))
+            self._put(worlds, *self.problem.first_state(episodes.start, scene))
 
     def place(self, worlds: Tensor, qpos: Tensor, qvel: Tensor) -> None:
         """Put ``worlds [n]`` at ``qpos [n, 59]`` and ``qvel [n, 58]`` without touching their time or episode.
@@ -373,13 +383,12 @@ class EgoPoseEnv(EnvBase):
         return target.numpy()
 
     def _watched(self, body: dict[str, Tensor], worlds: slice) -> dict[str, Tensor]:
-        """The watched parts of the present step beside the body, taken out of ``body``."""
-        tops, turns = body.pop("box_tops", None), body.pop("box_quaternions", None)
+        """The watched parts of the present step beside the body; all but the boxes are taken out of ``body``."""
         parts: dict[str, Tensor] = {
             name: body.pop(name) for name in ("floor_contacts", "box_contacts", "torques") if name in body
         }
         if "scene" in self.problem.watched:
-            parts["scene"] = torch.cat([tops, turns], dim=-1)  # type: ignore[list-item]
+            parts["scene"] = _scene(body)
         if "target" in self.problem.watched:
             parts["target"] = self._targets[worlds].clone()
         return parts
@@ -390,6 +399,9 @@ class EgoPoseEnv(EnvBase):
         frame, steps = clock["frame"].squeeze(-1), clock["episode_step"].squeeze(-1)
         parts = self._watched(body, worlds)
         view = self.problem.step_view(body, frame, steps, **_step_parts(parts))
+        if self.problem.memory_size:
+            self.memory[worlds] = self.problem.remembered(view, self.memory[worlds])
+            view = replace(view, memory=self.memory[worlds].clone())
         endings = self.problem.ended(view, torch.from_numpy(self._take[worlds]))
         terminated = stopped
         for name in self.problem.ends_episode:
@@ -431,6 +443,7 @@ class EgoPoseEnv(EnvBase):
             "frame": torch.from_numpy(self._frame.copy()),
             **({"placed": self.placed.clone()} if self.problem.remembers_start else {}),
             **({} if self.problem.motion_seen is None else {"laid": self.laid.clone()}),
+            **({"memory": self.memory.clone()} if self.problem.memory_size else {}),
             **self.starts.state_dict(),
         }
 
@@ -450,6 +463,8 @@ class EgoPoseEnv(EnvBase):
             self.placed = state_dict["placed"].clone()
         if self.problem.motion_seen is not None:
             self.laid = state_dict["laid"].clone()
+        if self.problem.memory_size:
+            self.memory = state_dict["memory"].clone()
         self.starts.load_state_dict(state_dict)
 
     def close(self, *, raise_if_closed: bool = True) -> None:

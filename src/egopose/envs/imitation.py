@@ -127,6 +127,7 @@ class ImitationProblem:
         self.remembers_start = action.reference == "start"
         self.actions_move_targets = action.kind == "pd"
         self.watched: frozenset[str] = reward.needs
+        self.memory_size = 0
         self.n_frames = reference.shape[0]
         self.reference = reference
         self.layout = BodyLayout(
@@ -171,7 +172,7 @@ class ImitationProblem:
             {k: torch.as_tensor(self.reference[k][frame]).to(torch.float64) for k in BODY_KEYS}, batch_size=frame.shape
         )
 
-    def first_state(self, frame: Tensor) -> tuple[Tensor, Tensor]:
+    def first_state(self, frame: Tensor, scene: Scene | None = None) -> tuple[Tensor, Tensor]:
         """``qpos [n, nq]`` and ``qvel [n, nv]`` of episodes that begin at global frames ``[n]``.
 
         The reference's, or where it stands and faces the state a forecast begins in.
@@ -235,6 +236,10 @@ class ImitationProblem:
         lowest = self.takes.lowest_head_height.index_select(0, take)
         head = view.body.xpos[:, self.humanoid.head, 2]
         return {"fallen": terminations.fallen(head, lowest, self.termination.head_drop)}
+
+    def remembered(self, view: StepView, memory: Tensor) -> Tensor:
+        """Nothing is kept."""
+        return memory
 
     def boxes(self, frame: Tensor, generator: torch.Generator) -> Scene | None:
         """None: reference motion is imitated on a bare floor."""

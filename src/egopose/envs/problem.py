@@ -125,6 +125,7 @@ class Problem(Protocol):
         actions_move_targets: whether an action is added to PD targets; False where it is a torque.
         watched: the parts of a step beyond the body that rewards or endings read, of
             :data:`egopose.envs.mdp.rewards.PARTS`.
+        memory_size: M, numbers kept of each world's episode for :meth:`remembered`; 0 for none.
     """
 
     humanoid: HumanoidModel
@@ -137,6 +138,7 @@ class Problem(Protocol):
     motion_seen: TargetMotion | None
     actions_move_targets: bool
     watched: frozenset[str]
+    memory_size: int
 
     def view(self, state: BodyState | BodyView) -> BodyView:
         """``state`` with the quantities derived from it; every other method takes either."""
@@ -162,8 +164,18 @@ class Problem(Protocol):
         """``[N]`` bool by ending, of a step of worlds that act out ``take [N]``."""
         ...
 
-    def first_state(self, frame: Tensor) -> tuple[Tensor, Tensor]:
-        """``qpos [n, nq]`` and ``qvel [n, nv]`` of episodes that begin at global frames ``[n]``."""
+    def remembered(self, view: StepView, memory: Tensor) -> Tensor:
+        """What is kept ``[N, M]`` after a step, from what was kept before it; zeros where an episode begins.
+
+        :meth:`ended` finds it in its view.
+        """
+        ...
+
+    def first_state(self, frame: Tensor, scene: Scene | None = None) -> tuple[Tensor, Tensor]:
+        """``qpos [n, nq]`` and ``qvel [n, nv]`` of episodes that begin at global frames ``[n]``.
+
+        ``scene`` is what :meth:`boxes` gave for them; None where there are no boxes.
+        """
         ...
 
     def boxes(self, frame: Tensor, generator: torch.Generator) -> Scene | None:

@@ -8,6 +8,7 @@ from typing import Any
 from egopose.evaluation.estimation_run import run_evaluation, summary
 from egopose.evaluation.forecast_run import run_forecast_evaluation
 from egopose.evaluation.options import data_at, output_folder, physics_group
+from egopose.evaluation.reconstruction_run import run_reconstruction
 from egopose.evaluation.reports import evaluation_report
 from egopose.evaluation.reset_threshold import choose_threshold
 from egopose.evaluation.take_videos import take_videos
@@ -21,7 +22,7 @@ def _estimates(*arguments: Any) -> str:
 
 
 #: How policies of a task are scored, by what the task says; see :class:`egopose.tasks.task.Task`.
-PROTOCOLS = {"estimates": _estimates, "forecasts": run_forecast_evaluation}
+PROTOCOLS = {"estimates": _estimates, "forecasts": run_forecast_evaluation, "reconstruction": run_reconstruction}
 
 
 def evaluate(values: Mapping[str, Any]) -> str:
@@ -44,7 +45,9 @@ def evaluate(values: Mapping[str, Any]) -> str:
     overrides |= {"corruption": values["corruption"]} if "corruption" in values else {}
     which, data = str(values["which"]), values["data_folder"]
     agents = [load_agent(path, which=which, overrides=overrides | data_at(data, path, which)) for path in paths]
-    names, videos = take_videos(agents[0].config)
+    # A clip's data comes from no store, and nobody wore a camera.
+    stored = agents[0].dataset.store_fingerprint is not None
+    names, videos = take_videos(agents[0].config) if stored else ([], [])
     spoilt = Corruption.from_config(values) is not None
     part = f"{values['split']}-corrupted" if spoilt else str(values["split"])
     out = output_folder(values["out"], agents[0].path, part)

@@ -17,7 +17,7 @@ from egopose.data.splits import WHOLE, split_takes
 from egopose.data.store import TakeStore
 from egopose.envs.mdp.observations import humanoid_state
 from egopose.pipeline.regressor import kept_tables, regressor_tables
-from egopose.tasks.dataset import Dataset, require_same_store, take_table
+from egopose.tasks.dataset import PROVENANCE, Dataset, require_same_store, take_table
 from egopose.tasks.task import task_of
 
 _SECOND = 30  # frames: what fragments of other sets have at least
@@ -91,7 +91,7 @@ def run_dataset(config: Mapping[str, Any], run: Path, same_store: bool = True, p
     Raises:
         InputError: as :func:`load_dataset`; the data is not the run's, or neither run nor store holds a regressor.
     """
-    if same_store:
+    if same_store and (run / PROVENANCE).is_file():
         # Checked before anything is prepared, since preparing can take hours.
         require_same_store(run, fingerprint_of(config))
     return task_of(config).dataset(config, PreparedData(config, run, progress))
@@ -147,6 +147,9 @@ def absolute_paths(config: dict[str, Any]) -> dict[str, Any]:
     if also := config.get("task", {}).get("also"):
         sets = {name: {**row, "folder": row["folder"] and _absolute(row["folder"])} for name, row in also.items()}
         out["task"] = {**config["task"], "also": sets}
+    task = out.get("task", {})
+    if files := {key: _absolute(task[key]) for key in ("clip", "start_from") if task.get(key)}:
+        out["task"] = {**task, **files}
     start = config.get("training", {}).get("start_from")
     if start is not None and not is_pretrained(start):
         out["training"] = {**config["training"], "start_from": _absolute(start)}

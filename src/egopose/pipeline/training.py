@@ -7,6 +7,7 @@ from typing import Any
 
 from egopose.checkpoint.resume import FINISHED, continued_job, finished, mark_finished, only_process, resumed_config
 from egopose.core.errors import InputError
+from egopose.pipeline.clip_start import teach_plan
 from egopose.pipeline.dataset import absolute_paths, load_dataset, run_dataset
 from egopose.pipeline.forecaster import with_forecasts
 from egopose.pipeline.run import build_evaluation, build_run, start_from
@@ -53,6 +54,8 @@ def run_training(
                 print(f"resuming {folder} after iteration {run.counters.iteration}", flush=True)
             elif (other := config["training"].get("start_from")) is not None:
                 start_from(run, str(other))
+            elif (teaching := config["task"].get("cloning")) is not None:
+                teach_plan(run, dataset, teaching)
             loggers = build_loggers(config["logger"], folder, config, run.counters.iteration, run.counters.frames)
             outcome = train(run, loggers, build_evaluation(run, dataset))
         finally:

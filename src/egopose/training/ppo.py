@@ -24,8 +24,10 @@ from egopose.core.config import from_mapping
 from egopose.core.errors import InputError
 from egopose.models.mixed_precision import bfloat16_products, has_bfloat16_products
 from egopose.models.recurrent import is_recurrent
+from egopose.training.adaptive_sampling import sampled_tuples
 
 AUTOCAST = ("auto", "bfloat16", "none")
+OPTIMIZERS = ("adam", "nesterov")
 
 
 class TrainingDiverged(RuntimeError):
@@ -44,8 +46,8 @@ class PPOSettings:
         epochs: passes over a batch.
         minibatch_size: steps in the environment a gradient step learns from; None for the full batch. Networks with a
             memory take as many whole sequences as that makes, at least one.
-        policy_lr: Adam's step size for the actor.
-        value_lr: Adam's step size for the critic.
+        policy_lr: the optimiser's step size for the actor.
+        value_lr: the optimiser's step size for the critic.
         policy_grad_norm: the actor's gradient is scaled down to this norm.
         value_grad_norm: the same for the critic; None for no limit.
         normalize_advantage: to zero mean and unit deviation over the batch.
@@ -57,6 +59,12 @@ class PPOSettings:
         max_nonfinite: gradient steps in a row that may be skipped for values that are not finite.
         autocast: ``bfloat16``: the MLPs learn in it, all else in float32; ``none``: float32 throughout; ``auto``:
             bfloat16 where the processor multiplies it. Runs from before this setting go on without.
+        optimizer: ``adam``, or ``nesterov``: gradient descent with that momentum.
+        momentum: of ``nesterov``.
+        adaptive_sampling: tuples of each episode that are learned from, see
+            :func:`egopose.training.adaptive_sampling.sampled_tuples`; None for all.
+        truncation_bootstraps: whether a time limit bootstraps from the critic; False where nothing comes after it, as
+            after a clip's end.
     """
 
     gamma: float
@@ -75,6 +83,10 @@ class PPOSettings:
     smoothness: float
     max_nonfinite: int
     autocast: str = "none"
+    optimizer: str = "adam"
+    momentum: float = 0.9
+    adaptive_sampling: int | None = None
+    truncation_bootstraps: bool = True
 
     @classmethod
     def from_config(cls, values: Any, source: str = "conf/algo") -> PPOSettings:
@@ -95,6 +107,12 @@ class PPOSettings:
     def _check(self, source: str) -> None:
         if self.autocast not in AUTOCAST:
             raise InputError(source, "autocast", f"must be one of {', '.join(AUTOCAST)}, not {self.autocast!r}")
+        if self.optimizer not in OPTIMIZERS:
+            raise InputError(source, "optimizer", f"must be {' or '.join(OPTIMIZERS)}, not {self.optimizer!r}")
+        if not 0 < self.momentum < 1:
+            raise InputError(source, "momentum", f"must lie between 0 and 1, not {self.momentum}")
+        if self.adaptive_sampling is not None and self.adaptive_sampling < 1:
+            raise InputError(source, "adaptive_sampling", f"must be null or at least 1, not {self.adaptive_sampling}")
         for name in ("policy_lr", "value_lr", "policy_grad_norm", "clip_epsilon"):
             if getattr(self, name) <= 0:
                 raise InputError(source, name, f"must be positive, not {getattr(self, name)}")
@@ -128,6 +146,8 @@ class PPO:
         self.actor, self.critic, self.settings = actor, critic, settings
         self.in_bfloat16 = settings.in_bfloat16
         self.recurrent = is_recurrent(actor) or is_recurrent(critic)
+        if self.recurrent and settings.adaptive_sampling is not None:
+            raise InputError("conf/algo", "adaptive_sampling", "takes tuples apart: not for networks with a memory")
         # Of the actor only its distribution: `_losses` runs its network, once for all that reads the mean action.
         self.loss = ClipPPOLoss(
             actor.module[-1],
@@ -148,8 +168,8 @@ class PPO:
         self.value_parameters = [p for p in critic.parameters() if p.requires_grad]
         if {id(p) for p in self.policy_parameters} & {id(p) for p in self.value_parameters}:
             raise ValueError("actor and critic share parameters; each needs its own")
-        self.policy_optimizer = torch.optim.Adam(self.policy_parameters, lr=settings.policy_lr, fused=True)
-        self.value_optimizer = torch.optim.Adam(self.value_parameters, lr=settings.value_lr, fused=True)
+        self.policy_optimizer = _optimizer(self.policy_parameters, settings.policy_lr, settings)
+        self.value_optimizer = _optimizer(self.value_parameters, settings.value_lr, settings)
         # Its only state is the step size, which the optimiser's own state holds.
         self.step_size: KLAdaptiveLR | None = None
         if settings.target_kl is not None:
@@ -167,12 +187,15 @@ class PPO:
     def advantages(self, batch: TensorDictBase) -> TensorDictBase:
         """Rows for the update with what the losses read, ``advantage`` and ``value_target`` among it.
 
-        They are ``[N * T]``, or sequences ``[N, T]`` where a network has a memory.
+        They are ``[N * T]`` (fewer with ``adaptive_sampling``), or sequences ``[N, T]`` where a network has a memory.
 
         Args:
             batch: ``[N, T]`` as collected.
         """
         self._values(batch)
+        if not self.settings.truncation_bootstraps:
+            batch = batch.copy()  # not of the tensors: what is collected goes on saying which episodes fell
+            batch["next", "terminated"] = batch["next", "done"]
         self.gae(batch)
         if self.in_bfloat16:
             self._act_again(batch)
@@ -181,6 +204,9 @@ class PPO:
             batch["smooth_loc"] = _between_neighbours(batch["loc"], batch["next", "done"])
         rows = batch.select(*[n for n in names if _root(n) != "next"], strict=False)
         rows = rows if self.recurrent else rows.reshape(-1)
+        if self.settings.adaptive_sampling is not None:
+            frame, done = batch["frame"].squeeze(-1), batch["next", "done"].squeeze(-1)
+            rows = _taken(rows, sampled_tuples(frame, done, self.settings.adaptive_sampling))
         advantage = rows["advantage"]
         if self.settings.normalize_advantage:
             rows["advantage"] = (advantage - advantage.mean()) / advantage.std().clamp_min(1e-6)
@@ -327,6 +353,12 @@ class PPO:
         if self.settings.smoothness <= 0:
             return losses, torch.zeros(())
         return losses, (now["loc"] - rows["smooth_loc"]).square().sum(dim=-1).mean()
+
+
+def _optimizer(parameters: list[torch.nn.Parameter], lr: float, settings: PPOSettings) -> torch.optim.Optimizer:
+    if settings.optimizer == "adam":
+        return torch.optim.Adam(parameters, lr=lr, fused=True)
+    return torch.optim.SGD(parameters, lr=lr, momentum=settings.momentum, nesterov=True, fused=True)
 
 
 def _between_neighbours(loc: Tensor, done: Tensor) -> Tensor:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 import torch
@@ -14,6 +14,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from egopose.envs.mdp import rotations as rot
+from egopose.humanoid.link_rates import LinkRates, Rates
 from egopose.humanoid.state_layout import StateLayout
 
 Array = NDArray[np.float64]
@@ -27,10 +28,29 @@ class BodyLayout:
     Args:
         parents: ``[J]`` index of the parent of every body but the root.
         end_effectors: ``[E]`` indices of hands, feet and head.
+        touching: what touches the scene, or None where nothing asks.
+        rates: velocities of the links, or None where nothing asks.
     """
 
     parents: Tensor
     end_effectors: Tensor
+    touching: TouchingPoints | None = None
+    rates: LinkRates | None = None
+
+
+@dataclass(frozen=True)
+class TouchingPoints:
+    """The end effectors that touch a scene: right foot, left foot, right hand, left hand.
+
+    Args:
+        bodies: ``[4]`` indices among the bodies.
+        points: ``[4, 3]`` m, the middle of the sole or the hand in the body's own frame.
+        head: index of the head.
+    """
+
+    bodies: Tensor
+    points: Tensor
+    head: int
 
 
 class BodyView:
@@ -127,6 +147,59 @@ class BodyView:
     def centre_of_mass(self) -> Tensor:
         """``[N, 3]`` m in the world."""
         return self._state["com"]
+
+    @cached_property
+    def joint_angles(self) -> Tensor:
+        """``[N, nu]`` rad."""
+        return self.qpos[:, 7:]
+
+    @property
+    def boxes(self) -> Tensor:
+        """``[N, K, 7]`` place (m, centre of the upper face) and quaternion of the world's boxes, where it has some."""
+        return torch.cat([self._state["box_tops"], self._state["box_quaternions"]], dim=-1)
+
+    @property
+    def xquat(self) -> Tensor:
+        """``[N, B, 4]`` of the bodies in the world."""
+        return self._state["xquat"]
+
+    @cached_property
+    def link_velocities(self) -> tuple[Tensor, Tensor]:
+        """Linear ``[N, B, 3]`` m/s and angular ``[N, B, 3]`` rad/s of the bodies, in the world.
+
+        Raises ValueError: the layout tells no rates.
+        """
+        rates = self._rates(slice(None))
+        return torch.from_numpy(rates.linear), torch.from_numpy(rates.angular)
+
+    def centre_of_mass_velocity(self, rows: Tensor) -> Tensor:
+        """``[n, 3]`` m/s in the world, of ``rows [n]``; raises ValueError as :attr:`link_velocities`."""
+        return torch.from_numpy(self._rates(rows.numpy()).centre_of_mass)
+
+    def _rates(self, rows: Any) -> Rates:
+        if self.layout.rates is None:
+            raise ValueError("this layout of the body tells no velocities of links")
+        return self.layout.rates(self.qpos.numpy()[rows], self.qvel.numpy()[rows])
+
+    @property
+    def touching(self) -> TouchingPoints:
+        """Raises ValueError: the layout names no end effectors that touch a scene."""
+        if self.layout.touching is None:
+            raise ValueError("this layout of the body names nothing that touches a scene")
+        return self.layout.touching
+
+    @cached_property
+    def touching_points(self) -> Tensor:
+        """``[N, 4, 3]`` m in the world, see :class:`TouchingPoints`."""
+        part = self.touching
+        turned = rot.rotate(self.xquat.index_select(1, part.bodies), part.points.expand(len(self.qpos), -1, -1))
+        return self.xpos.index_select(1, part.bodies) + turned
+
+    @cached_property
+    def up_angle(self) -> Tensor:
+        """``[N]`` rad between the way from the root to the head and the vertical."""
+        way = self.xpos[:, self.touching.head] - self.xpos[:, 0]
+        return torch.atan2(way[:, :2].norm(dim=-1), way[:, 2])
 
     @cached_property
     def humanoid_state(self) -> Tensor:

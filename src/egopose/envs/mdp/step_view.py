@@ -41,6 +41,7 @@ class StepView:
         torques: ``[N, nu]`` N m of the actuators.
         target: ``[N, nu]`` rad, the PD target of the step (N m where actions are torques).
         scene: ``[N, K, 7]`` place (m, centre of the upper face) and quaternion of each box.
+        memory: ``[N, M]`` what the problem keeps of the episode's steps, this one included.
     """
 
     body: BodyView
@@ -50,3 +51,4 @@ class StepView:
     torques: Tensor | None = None
     target: Tensor | None = None
     scene: Tensor | None = None
+    memory: Tensor | None = None
