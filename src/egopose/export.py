@@ -1,8 +1,10 @@
 """``python -m egopose.export MOTION_OR_EVALUATION to=FILE [to=FILE ...] [key=value ...]``: motions for other programs.
 
 The ending of each FILE says the format: .bvh .glb .amass.npz .trc .c3d .mot .forces.mot .torques.sto .csv .npz. Of an
-evaluation (a folder of `egopose evaluate`) every take is written; FILE then holds {take}. Further words are overrides
-of conf/export.yaml: options.up=z, part=reference, forces.enabled=false, and for reading the motion reader.up=y ...
+evaluation (a folder of `egopose evaluate`) every take is written; FILE then holds {take}. Of a reconstruction (a folder
+with plan.npz) the simulated motion is written with the simulation's own forces, and .numbers.csv holds its figures.
+Further words are overrides of conf/export.yaml: options.up=z, part=reference, forces.enabled=false, and for reading the
+motion reader.up=y ...
 """
 
 from __future__ import annotations

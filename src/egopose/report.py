@@ -1,7 +1,7 @@
 """``python -m egopose.report FOLDER [out=FILE] [key=value ...]``: one HTML page that holds everything it shows.
 
-FOLDER is one of `egopose evaluate`, or a sweep's (``hydra.sweep.dir``). Further words are overrides of
-conf/report.yaml. `egopose evaluate ... report=true` makes the same page of what it has just found.
+FOLDER is one of `egopose evaluate`, a sweep's (``hydra.sweep.dir``), or a reconstruction's. Further words are overrides
+of conf/report.yaml. `egopose evaluate ... report=true` makes the same page of what it has just found.
 """
 
 from __future__ import annotations

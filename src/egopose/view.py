@@ -2,7 +2,7 @@
 
 Sources: a motion file, a folder of an estimate, an evaluation's folder or a run directory; several are compared.
 Or `ws://127.0.0.1:8765/json`: what `egopose stream` sends, live. Or a folder of `egopose reconstruct prepare`: its
-scene, to be changed and saved.
+scene, to be changed and saved; a reconstruction's folder: what came of it.
 Words key=value are overrides of conf/sync.yaml: how motion files are read (reader.up=y) and, for `--offset auto` and
 the viewer's button Find, the camera.
 """
@@ -37,6 +37,7 @@ def command_line() -> argparse.ArgumentParser:
     parser.add_argument(
         "--offset", type=_offset, default=0.0, metavar="S", help="the motion's time 0 in the video; `auto` finds it"
     )
+    parser.add_argument("--scene", action="store_true", help="of a reconstruction: its scene, to be changed and saved")
     parser.add_argument("--address", default="127.0.0.1", help="to listen at; any but this machine's own needs a token")
     parser.add_argument("--port", type=int, default=8080, help="0 for a free one")
     parser.add_argument("--token", help="16 letters and digits at least; `new` makes one and prints it")
@@ -49,7 +50,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
     given = command_line().parse_args(arguments)
     try:
-        viewer = open_viewer(given.sources, given.video, given.offset, given.address, given.port, given.token)
+        where = (given.address, given.port, given.token)
+        viewer = open_viewer(given.sources, given.video, given.offset, *where, scene=given.scene)
     except InputError as error:
         print(f"error: {error}", file=sys.stderr)
         raise SystemExit(2) from None

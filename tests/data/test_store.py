@@ -30,8 +30,9 @@ from egopose.data.prepare_motion import reference_motion
 from egopose.data.reference import supported
 from egopose.data.report import store_report
 from egopose.data.splits import split_takes
-from egopose.data.store import Fragment, TakeInfo, TakeStore, runs_of
+from egopose.data.store import Fragment, TakeInfo, TakeStore
 from egopose.data.take_sources import find_sources
+from egopose.motion.contacts import runs_of
 from egopose.motion.motion import finite_difference
 from egopose.vision.video import VideoWriter
 

@@ -30,7 +30,7 @@ def elsewhere(true: SceneMotion, turn: float, shift: tuple[float, float], up: fl
     """The same motion and boxes in a world that is turned by ``-turn`` and begins at another place."""
     about = rot.from_axis_angle(np.array([0.0, 0.0, 1.0]), np.array(-turn))
     qpos = true.motion.qpos.copy()
-    qpos[:, :3] = rot.rotate(about, qpos[:, :3]) + [*shift, up]
+    qpos[:, :3] = rot.rotate(about, qpos[:, :3]) + np.array([*shift, up])
     qpos[:, 3:7] = rot.multiply(about, qpos[:, 3:7])
     c, s = np.cos(-turn), np.sin(-turn)
     boxes = []

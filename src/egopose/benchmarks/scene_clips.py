@@ -13,6 +13,7 @@ from egopose.benchmarks.scene_contacts import feet_touching, touching
 from egopose.core.errors import InputError
 from egopose.evaluation.scene_metrics import SceneMotion
 from egopose.humanoid.model import HumanoidModel
+from egopose.motion.contacts import without_short_runs
 from egopose.motion.motion import Motion
 from egopose.scene.clip import humanoid_in
 from egopose.scene.scene_file import Scene, read_scene
@@ -20,9 +21,12 @@ from egopose.scene.simulated import SimulatedMotion, load_simulated
 from egopose.scene.virtual_camera import KINDS
 
 _SOURCE = "bench scenes"
+_LONGEST_GAP = 2  # frames
 _SWITCH = {"true": True, "yes": True, "false": False, "no": False}
 NOISES = ("measured", "hard", "none")
 BOXES = ("guessed", "none")
+#: Whether a simulated body acts a clip out: not at all, among the boxes of the first guess, or among fitted ones.
+PHYSICS = ("none", "given", "fitted")
 
 
 @dataclass(frozen=True)
@@ -35,6 +39,7 @@ class Chosen:
         noise: of :data:`NOISES`.
         boxes: of :data:`BOXES`: whether the scene that is given has boxes, moved from their true places.
         gap: leave 30 frames without anybody.
+        physics: of :data:`PHYSICS`: whether a simulated body acts the clips out, and its boxes may change.
         folder: of the results; empty for one that is thrown away.
         judge_only: make nothing, judge what is in the folder.
         source: the folder of the true clips; empty for those that come with the project.
@@ -45,6 +50,7 @@ class Chosen:
     noise: tuple[str, ...] = ("measured",)
     boxes: tuple[str, ...] = ("guessed",)
     gap: bool = False
+    physics: tuple[str, ...] = ("none",)
     folder: str = ""
     judge_only: bool = False
     source: str = ""
@@ -69,7 +75,7 @@ class Chosen:
             else:
                 given[key] = text if key in ("folder", "source") else tuple(text.split(","))
         chosen = Chosen(**given)  # type: ignore[arg-type]
-        for key, names in (("cameras", KINDS), ("noise", NOISES), ("boxes", BOXES)):
+        for key, names in (("cameras", KINDS), ("noise", NOISES), ("boxes", BOXES), ("physics", PHYSICS)):
             if unknown := [one for one in getattr(chosen, key) if one not in names]:
                 raise InputError(_SOURCE, key, f"{unknown[0]!r:.40}; there are {', '.join(names)}")
         if chosen.judge_only and not chosen.folder:
@@ -133,6 +139,8 @@ def read_true_clip(folder: Path, humanoid: HumanoidModel) -> TrueClip:
 def simulated_feet(path: Path, simulated: SimulatedMotion, scene: Scene, humanoid: HumanoidModel) -> NDArray[np.bool_]:
     """``[T, 2]`` whether the right and the left foot touch anything, by playing a motion again.
 
+    Gaps of one or two frames are filled: sensors tell of the last substep alone.
+
     Raises:
         InputError: it is of another body or other boxes, or does not come back; names ``path``.
     """
@@ -143,6 +151,7 @@ def simulated_feet(path: Path, simulated: SimulatedMotion, scene: Scene, humanoi
         cause = f"coordinates, controls and boxes are {shapes}, not {(model.nq, model.nu, len(scene.boxes))}"
         raise InputError(path, "qpos", cause)
     try:
-        return feet_touching(among, touching(among, simulated))
+        feet = feet_touching(among, touching(among, simulated))
+        return ~without_short_runs(~feet, _LONGEST_GAP + 1)
     except RuntimeError as error:
         raise InputError(path, "ctrl", str(error)) from None

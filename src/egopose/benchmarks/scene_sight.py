@@ -44,8 +44,8 @@ class SightNoise:
             calibrated views was 1.0-2.8 % off (experiments/lifting).
         lasting, definition: shares of the error's variance that last for a second, and that are constant
             (conf/contacts.yaml).
-        across, depth: m, standard deviations an axis of a 3D landmark: a mean distance of about 95 mm, as measured on
-            the same views (experiments/lifting: 92-106 mm).
+        across, depth: m, standard deviations an axis of a 3D landmark; relative to the hips about
+            95 mm off in the mean, as on the same views (experiments/lifting: 92-106 mm).
         background: of a background point, picture heights: 1 pixel of 1,000.
         dropped: share of the keypoints that are not seen.
         wrong: frames, in the middle of the clip, in which another person is followed.
@@ -55,8 +55,8 @@ class SightNoise:
     error: tuple[float, float] = (0.01, 0.03)
     lasting: float = 0.35
     definition: float = 0.4
-    across: float = 0.04
-    depth: float = 0.085
+    across: float = 0.034
+    depth: float = 0.07
     background: float = 0.001
     dropped: float = 0.02
     wrong: int = 0
@@ -152,7 +152,9 @@ def _landmarks(points: Array, camera: CameraPath, noise: SightNoise, fps: float,
     error = error + np.sqrt(noise.lasting) * slow_noise(rng, shape, 1.0, fps)
     error = error + np.sqrt(1 - noise.lasting - noise.definition) * slow_noise(rng, shape, 0.05, fps)
     out += error * [noise.across, noise.across, noise.depth]
-    return np.asarray(out - out[:, [BODY_25.index("mid_hip")]])
+    middle = BODY_25.index("mid_hip")
+    out[:, middle] = out[:, [BODY_25.index(f"{side}_hip") for side in ("left", "right")]].mean(axis=1)
+    return np.asarray(out - out[:, [middle]])
 
 
 def _follow_another(pixels: Array, landmarks: Array, count: int) -> None:

@@ -9,13 +9,21 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 
 from egopose.humanoid.derivatives import Simulator, Single, state_difference
 from egopose.humanoid.foot_geometry import sole_positions
 from egopose.humanoid.inverse_dynamics import ForceSettings, with_forces
 from egopose.humanoid.model import HumanoidModel
-from egopose.humanoid.trajectory import Followed, Nominal, TrackingCost, TrajectoryOptimiser, feed_forward
+from egopose.humanoid.trajectory import (
+    Followed,
+    Nominal,
+    TrackingCost,
+    TrajectoryOptimiser,
+    feed_forward,
+    shifted,
+)
 from egopose.motion.motion import Motion, finite_difference
 from egopose.motion.rotations import Array
 from egopose.scene.clip import box_poses
@@ -31,12 +39,17 @@ class TruthSettings:
     """How the mocap is tracked.
 
     Args:
+        bodies: side by side. After each plan the worse half goes on from where the better half is.
+        noise: rad, standard deviation of what leads that half to other states, drawn for each plan.
         horizon, every: frames ahead, and between plans.
         iterations: of iterative LQR at each plan.
         reach: rad that a control may differ from the feed-forward.
         cost: against the mocap's root, joints and velocities.
+        seed: of the noise.
     """
 
+    bodies: int = 1
+    noise: float = 0.02
     horizon: int = 20
     every: int = 5
     iterations: int = 3
@@ -54,12 +67,23 @@ class TruthSettings:
             last=3.0,
         )
     )
+    seed: int = 0
+
+
+@dataclass(frozen=True)
+class _Block:
+    """What N bodies did between two plans: states after each step, controls, and whose place each body took."""
+
+    qpos: list[Array]
+    qvel: list[Array]
+    ctrl: list[Array]
+    parent: NDArray[np.int64]
 
 
 def track(
     humanoid: HumanoidModel, scene: Scene, motion: Motion, settings: TruthSettings, threads: int = 1
 ) -> SimulatedMotion:
-    """The motion as the simulated body can make it.
+    """The motion as the simulated body can make it: iterative LQR in a receding horizon, the fittest of some bodies.
 
     Args:
         humanoid: in the scene's worlds, see :func:`egopose.scene.clip.humanoid_in`.
@@ -69,44 +93,57 @@ def track(
         threads: of the physics.
     """
     tops, headings = box_poses(scene)
+    rng, every, count = np.random.default_rng(settings.seed), settings.every, settings.bodies
     simulator = Simulator(humanoid, _WORLDS, threads)
     simulator.place_boxes(tops, headings)
     optimiser = TrajectoryOptimiser(simulator, settings.cost, reach=settings.reach)
     followed = _followed(humanoid, motion, settings.horizon)
-    qpos, qvel = followed.qpos[:, 0], followed.qvel[:, 0]
-    states, controls = [(qpos[0], qvel[0])], []
+    start = followed.qpos[0, :1], followed.qvel[0, :1]
+    qpos, qvel = np.repeat(followed.qpos[:, 0], count, axis=0), np.repeat(followed.qvel[:, 0], count, axis=0)
+    blocks: list[_Block] = []
     plan: Nominal | None = None
     gains: Single = np.zeros(0, dtype=np.float32)
-    for at in range(0, len(motion) - 1, settings.every):
-        ahead = _window(followed, at, settings.horizon)
+    for at in range(0, len(motion) - 1, every):
+        ahead = _window(followed, at, settings.horizon, count)
         nominal = optimiser.simulate(qpos, qvel, ahead)
         if plan is not None:
-            by = settings.every
-            kept = settings.horizon - by
-            older = Nominal(
-                np.concatenate([plan.qpos[:, by:-1], ahead.qpos[:, kept:]], axis=1),
-                np.concatenate([plan.qvel[:, by:-1], ahead.qvel[:, kept:]], axis=1),
-                np.concatenate([plan.ctrl[:, by:], ahead.ctrl[:, kept:]], axis=1),
-                plan.cost,
-            )
-            later = np.concatenate([gains[:, by:], 0 * gains[:, :by]], axis=1)
+            later = np.concatenate([gains[:, every:], 0 * gains[:, :every]], axis=1)
+            older = shifted(plan, ahead, every)
             nominal = nominal.chosen(optimiser.simulate(qpos, qvel, ahead, older, gains=later))
         for _ in range(settings.iterations):
-            plan, gains = optimiser.improve(nominal, ahead)
-            if plan.cost[0] >= nominal.cost[0]:
-                break
-            nominal = plan
-        assert plan is not None
-        for step in range(min(settings.every, len(motion) - 1 - at)):
+            nominal, gains = optimiser.improve(nominal, ahead)
+        parent = np.tile(np.argsort(nominal.cost, kind="stable")[: -(-count // 2)], 2)[:count]
+        plan, gains = _picked(nominal, parent), gains[parent]
+        qpos, qvel = qpos[parent], qvel[parent]
+        astray = (
+            settings.noise
+            * rng.normal(size=(count, plan.ctrl.shape[2]))
+            * (np.arange(count) >= -(-count // 2))[:, None]
+        )
+        block = _Block([], [], [], parent)
+        for step in range(min(every, len(motion) - 1 - at)):
             away = state_difference(qpos, qvel, plan.qpos[:, step], plan.qvel[:, step])
-            ctrl = plan.ctrl[:, step] + np.einsum("nij,nj->ni", gains[:, step], away)
+            ctrl = plan.ctrl[:, step] + np.einsum("nij,nj->ni", gains[:, step], away) + astray
             qpos, qvel = simulator.step(qpos, qvel, ctrl)
-            states.append((qpos[0], qvel[0]))
-            controls.append(ctrl[0])
+            for kept, value in ((block.qpos, qpos), (block.qvel, qvel), (block.ctrl, ctrl)):
+                kept.append(value)
+        blocks.append(block)
     simulator.close()
-    return SimulatedMotion(
-        np.array([q for q, _ in states]), np.array([v for _, v in states]), np.array(controls), tops, headings
-    )
+    return _traced(blocks, start, tops, headings)
+
+
+def _picked(plan: Nominal, rows: NDArray[np.int64]) -> Nominal:
+    return Nominal(plan.qpos[rows], plan.qvel[rows], plan.ctrl[rows], plan.cost[rows])
+
+
+def _traced(blocks: list[_Block], start: tuple[Array, Array], tops: Array, headings: Array) -> SimulatedMotion:
+    """The way that led to the first body of the last block, the best one there."""
+    row, parts = 0, []
+    for block in reversed(blocks):
+        parts.append(tuple(np.stack([step[row] for step in steps]) for steps in (block.qpos, block.qvel, block.ctrl)))
+        row = int(block.parent[row])
+    qpos, qvel, ctrl = (np.concatenate([part[k] for part in reversed(parts)]) for k in range(3))
+    return SimulatedMotion(np.concatenate([start[0], qpos]), np.concatenate([start[1], qvel]), ctrl, tops, headings)
 
 
 def _followed(humanoid: HumanoidModel, motion: Motion, beyond: int) -> Followed:
@@ -127,6 +164,8 @@ def _flat(humanoid: HumanoidModel, motion: Motion) -> Array:
     return qpos
 
 
-def _window(followed: Followed, at: int, horizon: int) -> Followed:
+def _window(followed: Followed, at: int, horizon: int, count: int) -> Followed:
+    """The frames from ``at`` on, the same for ``count`` bodies."""
     states, steps = slice(at, at + horizon + 1), slice(at, at + horizon)
-    return Followed(followed.qpos[:, states], followed.qvel[:, states], followed.ctrl[:, steps])
+    parts = (followed.qpos[:, states], followed.qvel[:, states], followed.ctrl[:, steps])
+    return Followed(*(np.repeat(part, count, axis=0) for part in parts))

@@ -1,7 +1,8 @@
-"""Motion capture of a flat floor lifted onto boxes: the feet's heights and the pelvis's change, the legs follow.
+"""Motion capture of a flat floor lifted onto boxes: heights of feet, hands and pelvis change, the limbs follow.
 
-A stance is a time in which a foot stands. Each stance gets the height of what it is to stand on. Between stances a foot
-rises early and sinks late, so that it clears a box's edge. The pelvis rises with the mean height under the feet.
+A stance is a time in which a foot or a hand stands. Each stance gets the height of what it is to stand on. Between
+stances a foot rises early and sinks late, so that it clears a box's edge. The pelvis rises with the mean height under
+all that stands.
 """
 
 from __future__ import annotations
@@ -11,7 +12,6 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 
 from egopose.humanoid.foot_geometry import sole_edges, sole_positions
@@ -21,23 +21,27 @@ from egopose.motion.contacts import without_short_runs
 from egopose.motion.inverse_kinematics import Targets, solve
 from egopose.motion.motion import Motion
 from egopose.motion.rotations import Array
+from egopose.motion.skeleton import Skeleton
 from egopose.scene.scene_file import Box
 
 #: Share of a swing in which a foot rises to what it has to clear, and in which it sinks from it.
 _RISEN = 0.45
 #: s, standard deviation of the smoothing of the pelvis's height.
 _SMOOTH = 0.12
-#: Frames: shorter stances are noise.
-_SHORTEST = 3
+#: Frames: shorter stances are noise; and in so many a hand that does not stand yet, or any more, is let go.
+_SHORTEST, _LET_GO = 3, 6
+#: m/s and m: hands that are slower and lower stand. They roll over what they stand on.
+_HAND_SPEED, _HAND_LOWNESS = 1.3, 0.08
+_HANDS = ("RightHand", "LeftHand")
 #: In inverse kinematics soles count fully and the pelvis ten times that; m per rad of staying.
 _PELVIS, _STAY = 10.0, 0.01
 
 
 @dataclass(frozen=True)
 class Stance:
-    """A foot that stands in frames ``start .. stop - 1``; ``foot`` is its index in ``humanoid.feet``."""
+    """A limb that stands in frames ``start .. stop - 1``: of ``humanoid.feet``, then the right and the left hand."""
 
-    foot: int
+    limb: int
     start: int
     stop: int
 
@@ -52,7 +56,7 @@ class Platform:
         height: m, of its upper face.
         margin: m, around the soles, along and across the box.
         yaw: rad, of the box's own x.
-        foot: only this one's stances; None for both.
+        limb: only this one's stances; None for all.
     """
 
     name: str
@@ -61,14 +65,37 @@ class Platform:
     height: float
     margin: tuple[float, float]
     yaw: float = 0.0
-    foot: int | None = None
+    limb: int | None = None
 
     def under(self, stance: Stance) -> bool:
         """Whether the stance is on it."""
-        return self.first <= 0.5 * (stance.start + stance.stop - 1) <= self.last and self.foot in (None, stance.foot)
+        return self.first <= 0.5 * (stance.start + stance.stop - 1) <= self.last and self.limb in (None, stance.limb)
 
 
-def stances(humanoid: HumanoidModel, motion: Motion, speed: float = 0.35, lowness: float | None = 0.06) -> list[Stance]:
+def limb_points(humanoid: HumanoidModel, motion: Motion) -> list[Array]:
+    """``[T, P, 3]`` m of each foot's heel and ball, then of each hand's tip: what stands."""
+    feet = sole_positions(humanoid, motion)
+    positions, quats = motion.forward_kinematics()
+    tips = [
+        positions[:, hand, None] + rot.rotate(quats[:, hand], tip[None])[:, None]
+        for hand, tip in zip(*_hands(motion.skeleton), strict=True)
+    ]
+    return [*np.split(feet, len(humanoid.feet), axis=1), *tips]
+
+
+def _hands(skeleton: Skeleton) -> tuple[list[int], list[Array]]:
+    """Joints of the hands, and their tips in them (m)."""
+    rows = [skeleton.index(name) for name in _HANDS]
+    return rows, [np.array(skeleton.joints[row].tips[0]) for row in rows]
+
+
+def stances(
+    humanoid: HumanoidModel,
+    motion: Motion,
+    speed: float = 0.35,
+    lowness: float | None = 0.06,
+    hands: bool = False,
+) -> list[Stance]:
     """When feet stand: heel or ball is slow, and low over z = 0 where the floor is flat.
 
     Args:
@@ -76,41 +103,48 @@ def stances(humanoid: HumanoidModel, motion: Motion, speed: float = 0.35, lownes
         motion: on its skeleton.
         speed: m/s, a point that is slower stands.
         lowness: m, it must also be lower than this; None where the motion is not on a flat floor.
+        hands: whether hands stand, too.
     """
-    points = sole_positions(humanoid, motion)
-    slow = np.linalg.norm(np.gradient(points, axis=0), axis=2) * motion.fps < speed
-    if lowness is not None:
-        slow &= points[..., 2] < lowness
-    standing = slow.reshape(len(motion), len(humanoid.feet), -1).any(axis=2)
-    standing = ~without_short_runs(~without_short_runs(standing, _SHORTEST), _SHORTEST)
     out = []
-    for foot in range(len(humanoid.feet)):
-        edges = np.flatnonzero(np.diff(np.concatenate([[0], standing[:, foot].astype(np.int8), [0]])))
-        out += [Stance(foot, int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)]
-    return sorted(out, key=lambda stance: (stance.start, stance.foot))
+    for limb, points in enumerate(limb_points(humanoid, motion)):
+        hand = limb >= len(humanoid.feet)
+        if hand and not hands:
+            break
+        standing = np.linalg.norm(np.gradient(points, axis=0), axis=2) * motion.fps < (_HAND_SPEED if hand else speed)
+        if lowness is not None:
+            standing &= points[..., 2] < (_HAND_LOWNESS if hand else lowness)
+        runs = standing.any(axis=1, keepdims=True)
+        runs = ~without_short_runs(~without_short_runs(runs, _SHORTEST), _SHORTEST)
+        edges = np.flatnonzero(np.diff(np.concatenate([[0], runs[:, 0].astype(np.int8), [0]])))
+        out += [Stance(limb, int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)]
+    return sorted(out, key=lambda stance: (stance.start, stance.limb))
 
 
 def lifted(humanoid: HumanoidModel, motion: Motion, standing: Sequence[Stance], heights: Sequence[float]) -> Motion:
     """The motion with each stance at its height, m over where it was.
 
     Raises:
-        ValueError: no foot ever stands.
+        ValueError: nothing ever stands.
     """
     if not standing:
-        raise ValueError("no foot ever stands")
-    frames = len(motion)
-    feet = np.stack([_foot_height(frames, k, standing, heights) for k in range(len(humanoid.feet))], axis=1)
-    pelvis = _pelvis_height(frames, motion.fps, standing, heights)
+        raise ValueError("nothing ever stands")
+    frames, feet = len(motion), len(humanoid.feet)
     qpos = motion.qpos.copy()
-    qpos[:, 2] += pelvis
-    goal = sole_positions(humanoid, motion)
-    points = goal.shape[1] // len(humanoid.feet)
-    goal[..., 2] += np.repeat(feet, points, axis=1)
+    qpos[:, 2] += _pelvis_height(frames, motion.fps, standing, heights)
+    joints, offsets = [*humanoid.feet.tolist()], list(humanoid.sole_points)
+    for hand, tip in zip(*_hands(motion.skeleton), strict=True):
+        joints.append(hand)
+        offsets.append(tip[None])
+    goals, weights = [], []
+    for limb, points in enumerate(limb_points(humanoid, motion)):
+        goals.append(points + [[[0.0, 0.0, 1.0]]] * _limb_height(frames, limb, standing, heights)[:, None, None])
+        held = np.ones(frames) if limb < feet else _held(frames, limb, standing)
+        weights.append(np.repeat(held[:, None], points.shape[1], axis=1))
     targets = Targets(
-        point_joint=np.concatenate([np.repeat(humanoid.feet, points), [0]]),
-        point_offset=np.concatenate([humanoid.sole_points.reshape(-1, 3), np.zeros((1, 3))]),
-        positions=np.concatenate([goal, qpos[:, None, :3]], axis=1),
-        position_weight=np.array([1.0] * goal.shape[1] + [_PELVIS]),
+        point_joint=np.concatenate([*(np.full(len(o), j) for j, o in zip(joints, offsets, strict=True)), [0]]),
+        point_offset=np.concatenate([*offsets, np.zeros((1, 3))]),
+        positions=np.concatenate([*goals, qpos[:, None, :3]], axis=1),
+        position_weight=np.concatenate([*weights, np.full((frames, 1), _PELVIS)], axis=1),
         frame_joint=np.array([0]),
         orientations=qpos[:, None, 3:7],
         orientation_weight=np.array([_PELVIS]),
@@ -119,9 +153,19 @@ def lifted(humanoid: HumanoidModel, motion: Motion, standing: Sequence[Stance], 
     return Motion(motion.skeleton, solved, motion.fps, motion.name)
 
 
-def _foot_height(frames: int, foot: int, standing: Sequence[Stance], heights: Sequence[float]) -> Array:
+def _held(frames: int, limb: int, standing: Sequence[Stance]) -> Array:
+    """``[T]``: 1 while a hand stands, less the further from that, and 0 for one that does not stand."""
+    out = np.zeros(frames)
+    for stance in standing:
+        if stance.limb == limb:
+            away = np.maximum(stance.start - np.arange(frames), np.arange(frames) - stance.stop + 1)
+            out = np.maximum(out, _smooth_step(1 - away / _LET_GO))
+    return out
+
+
+def _limb_height(frames: int, limb: int, standing: Sequence[Stance], heights: Sequence[float]) -> Array:
     """``[T]`` m: constant in a stance, a smooth step between two."""
-    own = [(s, h) for s, h in zip(standing, heights, strict=True) if s.foot == foot]
+    own = [(s, h) for s, h in zip(standing, heights, strict=True) if s.limb == limb]
     out = np.zeros(frames)
     if not own:
         return out
@@ -129,7 +173,7 @@ def _foot_height(frames: int, foot: int, standing: Sequence[Stance], heights: Se
     for (one, low), (other, high) in pairwise(own):
         swing = np.arange(one.stop - 1, other.start + 1)
         share = (swing - swing[0]) / max(swing[-1] - swing[0], 1)
-        # What the other foot stands on meanwhile lies on the way.
+        # What another limb stands on meanwhile lies on the way.
         passed = [h for s, h in zip(standing, heights, strict=True) if s.start < other.start and s.stop > one.stop]
         peak = max(low, high, *passed)
         out[swing] = peak - (peak - low) * _smooth_step(1 - share / _RISEN)
@@ -145,7 +189,7 @@ def _smooth_step(share: Array) -> Array:
 
 
 def _pelvis_height(frames: int, fps: float, standing: Sequence[Stance], heights: Sequence[float]) -> Array:
-    """``[T]`` m: the mean height under the feet that stand, straight lines between, smoothed."""
+    """``[T]`` m: the mean height under all that stands, straight lines between, smoothed."""
     total, count = np.zeros(frames), np.zeros(frames)
     for stance, height in zip(standing, heights, strict=True):
         total[stance.start : stance.stop] += height
@@ -155,23 +199,19 @@ def _pelvis_height(frames: int, fps: float, standing: Sequence[Stance], heights:
     return gaussian_filter1d(line, _SMOOTH * fps, mode="nearest")
 
 
-def platform_of(stance: Stance, platforms: Sequence[Platform]) -> Platform | None:
-    """The platform under a stance; None for the floor."""
-    return next((platform for platform in platforms if platform.under(stance)), None)
-
-
 def boxes_under(
     humanoid: HumanoidModel, motion: Motion, standing: Sequence[Stance], platforms: Sequence[Platform]
 ) -> list[Box]:
-    """Boxes around the soles of the stances on each platform.
+    """Boxes around the soles and the hands' tips of the stances on each platform.
 
     Raises:
         ValueError: nothing stands on a platform.
     """
-    corners = sole_edges(humanoid, motion).reshape(len(motion), len(humanoid.feet), -1, 3)
+    edges = np.split(sole_edges(humanoid, motion), len(humanoid.feet), axis=1)
+    corners = [*edges, *limb_points(humanoid, motion)[len(edges) :]]
     out = []
     for platform in platforms:
-        soles = [corners[s.start : s.stop, s.foot, :, :2].reshape(-1, 2) for s in standing if platform.under(s)]
+        soles = [corners[s.limb][s.start : s.stop, :, :2].reshape(-1, 2) for s in standing if platform.under(s)]
         if not soles:
             raise ValueError(f"nothing stands on {platform.name}")
         ahead = np.array([np.cos(platform.yaw), np.sin(platform.yaw)])
@@ -189,13 +229,3 @@ def boxes_under(
             )
         )
     return out
-
-
-def turned(motion: Motion, angle: float, place: NDArray[np.floating]) -> Motion:
-    """The motion turned about the vertical by ``angle`` (rad), then moved by ``place [2]`` (m)."""
-    turn = rot.from_axis_angle(np.array([0.0, 0.0, 1.0]), np.array(angle))
-    qpos = motion.qpos.copy()
-    qpos[:, :3] = rot.rotate(turn, qpos[:, :3])
-    qpos[:, :2] += place
-    qpos[:, 3:7] = rot.multiply(turn, qpos[:, 3:7])
-    return Motion(motion.skeleton, qpos, motion.fps, motion.name)

@@ -18,11 +18,12 @@ from tensordict import TensorDict
 from egopose.core.errors import InputError
 from egopose.data.lock import store_lock
 from egopose.data.motion_stage import PreparedTake, prepared_takes
-from egopose.data.store import REFERENCE_KEYS, Fragment, LeftOut, TakeInfo, TakeStore, runs_of
+from egopose.data.store import REFERENCE_KEYS, Fragment, LeftOut, TakeInfo, TakeStore
 from egopose.data.table_sources import left_out_rows
 from egopose.data.take_sources import find_sources
 from egopose.humanoid.config import HumanoidConfig, SimConfig
 from egopose.humanoid.model import HumanoidModel, build_humanoid
+from egopose.motion.contacts import runs_of
 from egopose.motion.notes import notes_of
 from egopose.vision.corruption import Corruption
 from egopose.vision.features import extract_flow

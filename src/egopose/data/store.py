@@ -26,7 +26,6 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 from tensordict import MemoryMappedTensor, TensorDict
 from torch import Tensor
@@ -375,9 +374,3 @@ def _left_out(path: Path, rows: Any) -> tuple[LeftOut, ...]:
     if not isinstance(rows, list) or not all(isinstance(row, dict) for row in rows):
         raise InputError(path, "left_out", f"is damaged: must be a list of clips, not {rows!r:.60}")
     return tuple(from_mapping(LeftOut, row, f"{path}: left_out") for row in rows)
-
-
-def runs_of(mask: np.ndarray) -> tuple[tuple[int, int], ...]:
-    """``[start, stop)`` of every run of True in a boolean array ``[T]``."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], np.asarray(mask, dtype=np.int8), [0]])))
-    return tuple((int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True))

@@ -63,6 +63,21 @@ def foot_skate(feet: Array, contacts: NDArray[np.bool_], fps: float = 30.0) -> f
     return float(speed[planted].mean()) if planted.any() else float("nan")
 
 
+def foot_slide(soles: Array, touching: NDArray[np.bool_], fps: float) -> float:
+    """Mean horizontal speed (m/s) of feet that touch something in a frame and the next; NaN if none ever does.
+
+    Of a foot's points the slowest counts: a foot that rolls from heel to ball does not slide.
+
+    Args:
+        soles: ``[T, F, P, 3]`` positions of each foot's points, m.
+        touching: ``[T, F]``.
+        fps: frames per second.
+    """
+    speed = np.linalg.norm(np.diff(soles[..., :2], axis=0), axis=-1).min(axis=-1) * fps
+    planted = touching[1:] & touching[:-1]
+    return float(speed[planted].mean()) if planted.any() else float("nan")
+
+
 def ground_penetration(points: Array, ground: float = 0.0) -> Array:
     """Depth ``[T]`` of the lowest of ``points [T, P, 3]`` under the ground, 0 where nothing is under it."""
     return np.maximum(ground - points[..., 2].min(axis=-1), 0.0)

@@ -1,7 +1,7 @@
 """``python -m egopose.report FOLDER [out=FILE] [key=value ...]``: one HTML page that holds everything it shows.
 
-FOLDER is one of `egopose evaluate`, or a sweep's (``hydra.sweep.dir``). Further words are overrides of
-conf/report.yaml. `egopose evaluate ... report=true` makes the same page of what it has just found.
+FOLDER is one of `egopose evaluate`, a sweep's (``hydra.sweep.dir``), or a reconstruction's. Further words are overrides
+of conf/report.yaml. `egopose evaluate ... report=true` makes the same page of what it has just found.
 """
 
 from __future__ import annotations
@@ -16,9 +16,11 @@ from egopose.core.errors import InputError
 from egopose.core.safe_io import read_json
 from egopose.evaluation.estimation_page import ReportSettings, write_report
 from egopose.evaluation.forecast_page import write_forecast_page
+from egopose.evaluation.reconstruction_page import PAGE, ReconstructionPageSettings, write_reconstruction_page
 from egopose.evaluation.sweep_report import SweepSettings, write_sweep_report
 from egopose.humanoid.model import HumanoidModel
 from egopose.inference.export import humanoid_for
+from egopose.inference.reconstruction import read_reconstruction, reconstruction_folder, simulated_humanoid
 
 _SOURCE = "conf/report.yaml"
 
@@ -32,15 +34,33 @@ def evaluation_report(folder: Path, humanoid: HumanoidModel | None, overrides: S
     return write(folder, humanoid, settings, _out(config, folder))
 
 
+def reconstruction_report(folder: Path, overrides: Sequence[str] = ()) -> Path:
+    """Write the page of a reconstruction's folder.
+
+    Raises:
+        InputError: a file is missing or damaged, or the controls do not lead through the states.
+    """
+    config = compose_config("report", overrides)
+    settings = from_mapping(ReconstructionPageSettings, config["reconstruction"], f"{_SOURCE}: reconstruction")
+    found = read_reconstruction(folder, simulated_humanoid(str(config["humanoid"])))
+    return write_reconstruction_page(found, settings, _out(config, folder, PAGE))
+
+
 def run_report(folder: Path, overrides: Sequence[str] = ()) -> Path:
     """Write the page of whatever the folder is.
 
     Raises:
-        InputError: it is neither an evaluation nor a sweep, or damaged; names it.
+        InputError: it is no evaluation, sweep or reconstruction, or damaged; names it.
     """
     if not folder.is_dir():
-        cause = "is a file; give the folder of an evaluation or a sweep" if folder.exists() else "no such folder"
+        cause = (
+            "is a file; give the folder of an evaluation, a sweep or a reconstruction"
+            if folder.exists()
+            else "no such folder"
+        )
         raise InputError(folder, "path", cause)
+    if reconstruction_folder(folder) is not None:
+        return reconstruction_report(folder, overrides)
     if (folder / "results.json").is_file():
         try:
             humanoid = humanoid_for(folder, "default")
@@ -53,8 +73,8 @@ def run_report(folder: Path, overrides: Sequence[str] = ()) -> Path:
     return write_sweep_report(folder, settings, _out(config, folder))
 
 
-def _out(config: Mapping[str, Any], folder: Path) -> Path:
-    out = folder / "report.html" if config["out"] is None else Path(str(config["out"]))
+def _out(config: Mapping[str, Any], folder: Path, name: str = "report.html") -> Path:
+    out = folder / name if config["out"] is None else Path(str(config["out"]))
     if not out.parent.is_dir():
         raise InputError(out, "out", f"no folder {out.parent}")
     return out

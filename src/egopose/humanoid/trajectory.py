@@ -105,6 +105,17 @@ def feed_forward(humanoid: HumanoidModel, qpos: Array, qvel: Array, torques: Arr
     return np.asarray(qpos[..., 1:, 7:] + lag * qvel[..., 1:, 6:] + mean / humanoid.kp)
 
 
+def shifted(plan: Nominal, followed: Followed, by: int) -> Nominal:
+    """A plan ``by`` frames later: what follows its end is the feed-forward about the motion itself."""
+    kept = plan.ctrl.shape[1] - by
+    return Nominal(
+        np.concatenate([plan.qpos[:, by:-1], followed.qpos[:, kept:]], axis=1),
+        np.concatenate([plan.qvel[:, by:-1], followed.qvel[:, kept:]], axis=1),
+        np.concatenate([plan.ctrl[:, by:], followed.ctrl[:, kept:]], axis=1),
+        plan.cost,
+    )
+
+
 class TrajectoryOptimiser:
     """Iterative LQR for N bodies side by side.
 

@@ -1,14 +1,15 @@
 """``python -m egopose.export MOTION_OR_EVALUATION to=FILE [to=FILE ...] [key=value ...]``: motions for other programs.
 
 The ending of each FILE says the format: .bvh .glb .amass.npz .trc .c3d .mot .forces.mot .torques.sto .csv .npz. Of an
-evaluation (a folder of `egopose evaluate`) every take is written; FILE then holds {take}. Further words are overrides
-of conf/export.yaml: options.up=z, part=reference, forces.enabled=false ...
+evaluation (a folder of `egopose evaluate`) every take is written; FILE then holds {take}. Of a reconstruction (a folder
+with plan.npz) the simulated motion is written with the simulation's own forces, and .numbers.csv holds its figures.
+Further words are overrides of conf/export.yaml: options.up=z, part=reference, forces.enabled=false ...
 """
 
 from __future__ import annotations
 
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,14 +20,25 @@ from egopose.core.safe_io import read_json
 from egopose.data.preparation import humanoid_of
 from egopose.humanoid.inverse_dynamics import ForceSettings, with_forces
 from egopose.humanoid.model import HumanoidModel
+from egopose.humanoid.replayed_forces import every_step
+from egopose.inference.reconstruction import (
+    PLAN,
+    Reconstruction,
+    read_reconstruction,
+    reconstruction_folder,
+    simulated_humanoid,
+)
 from egopose.motion.io import WRITERS, given_options, read_motion, write_motion, writer_suffix
 from egopose.motion.motion import Motion
 from egopose.motion.notes import tell_notes
 from egopose.motion.plausibility import source_findings, tell
+from egopose.scene.movement_numbers import write_numbers_csv
 
 _SOURCE = "conf/export.yaml"
 #: Endings of what cannot be written without forces, and of what holds them besides.
 _ONLY_FORCES, _HOLD_FORCES = (".forces.mot", ".torques.sto"), (".glb", ".c3d", ".csv", ".npz")
+#: The ending of a reconstruction's figures: a table, no motion.
+NUMBERS = ".numbers.csv"
 
 
 def run_export(source: Path, files: Sequence[str], config: Mapping[str, Any]) -> list[Path]:
@@ -34,8 +46,8 @@ def run_export(source: Path, files: Sequence[str], config: Mapping[str, Any]) ->
 
     Args:
         source: a motion file that :func:`egopose.motion.io.read_motion` knows, a folder of `egopose evaluate` or
-            `egopose estimate`.
-        files: names to write; ``{take}`` in them becomes the take's name.
+            `egopose estimate`, or a reconstruction: its folder or the ``plan.npz`` in it.
+        files: names to write; ``{take}`` in them becomes the take's name, of a reconstruction its folder's.
         config: resolved ``conf/export.yaml``.
 
     Returns:
@@ -46,11 +58,16 @@ def run_export(source: Path, files: Sequence[str], config: Mapping[str, Any]) ->
             motion; names it.
     """
     if not files:
-        raise InputError("export", "to", f"says no file; endings are {', '.join(WRITERS)}")
-    motions = motion_files(source, str(config["part"]), config["take"])
-    if len(motions) > 1 and (same := [f for f in files if "{take}" not in f]):
-        raise InputError(source, "to", f"{len(motions)} takes would all go to {same[0]}; put {{take}} into the name")
-    suffixes = {file: writer_suffix(Path(file)) for file in files}
+        raise InputError("export", "to", f"says no file; endings are {', '.join([*WRITERS, NUMBERS])}")
+    _check_part(str(config["part"]))
+    folder = reconstruction_folder(source)
+    found = (
+        None if folder is None else read_reconstruction(folder, simulated_humanoid(str(config["forces"]["humanoid"])))
+    )
+    numbers = [file for file in files if file.lower().endswith(NUMBERS)]
+    if numbers and found is None:
+        raise InputError(source, "to", f"{NUMBERS} needs a reconstruction: a folder with plan.npz")
+    suffixes = {file: writer_suffix(Path(file)) for file in files if file not in numbers}
     options = known_options(config["options"], set(suffixes.values()))
     enabled = config["forces"]["enabled"]
     if enabled not in ("auto", True, False):
@@ -58,28 +75,63 @@ def run_export(source: Path, files: Sequence[str], config: Mapping[str, Any]) ->
     needed = any(suffix in _ONLY_FORCES for suffix in suffixes.values())
     held = any(suffix in _HOLD_FORCES for suffix in suffixes.values())
     written = []
-    for take, path in motions.items():
-        motion = read_motion(path, **(given_options(config["reader"]) if path == source else {}))
-        if path == source:
-            tell(source_findings(motion), take, lambda line: print(line, file=sys.stderr))
+    for take, path, motion in _motions(source, found, files, config):
         tell_notes(take, motion, lambda line: print(line, file=sys.stderr))
         if enabled is not False and (needed or held) and motion.ground_reaction is None:
             motion = _with_forces(motion, source, config, required=needed or enabled is True)
-        for file, suffix in suffixes.items():
+        for file in files:
             target = Path(file.replace("{take}", take))
             if target.exists() and target.samefile(path):
                 raise InputError(target, "to", "is the motion itself, which stays as it is; give another name")
             target.parent.mkdir(parents=True, exist_ok=True)
-            try:
-                write_motion(motion, target, **{k: v for k, v in options.items() if k in _keywords(suffix)})
-            except InputError:
-                raise
-            except KeyError as error:
-                raise InputError(target, "options", f"{error} is no unit or axis of this format") from None
-            except ValueError as error:
-                raise InputError(target, suffix, f"cannot hold {path}: {error}") from None
+            if found is not None and file in numbers:
+                write_numbers_csv(found.numbers.rows(), target)
+            else:
+                suffix = suffixes[file]
+                chosen = {k: v for k, v in options.items() if k in _keywords(suffix)}
+                _write(motion, path, target, suffix, chosen)
             written.append(target)
     return written
+
+
+def _motions(
+    source: Path, found: Reconstruction | None, files: Sequence[str], config: Mapping[str, Any]
+) -> Iterator[tuple[str, Path, Motion]]:
+    """Name, file and motion of every take."""
+    if found is not None and config["part"] == "estimate":
+        if config["rate"] not in ("control", "physics"):
+            raise InputError(_SOURCE, "rate", f"must be control or physics, not {config['rate']!r}")
+        stepwise = config["rate"] == "physics"
+        motion = every_step(found.humanoid, found.forces, found.motion.name) if stepwise else found.motion
+        yield found.folder.resolve().name, found.folder / PLAN, motion
+        return
+    if found is not None:
+        files_of = {found.folder.resolve().name: found.folder / "body.npz"}
+    else:
+        files_of = motion_files(source, str(config["part"]), config["take"])
+    if len(files_of) > 1 and (same := [f for f in files if "{take}" not in f]):
+        raise InputError(source, "to", f"{len(files_of)} takes would all go to {same[0]}; put {{take}} into the name")
+    for take, path in files_of.items():
+        motion = read_motion(path, **(given_options(config["reader"]) if path == source else {}))
+        if path == source:
+            tell(source_findings(motion), take, lambda line: print(line, file=sys.stderr))
+        yield take, path, motion
+
+
+def _write(motion: Motion, path: Path, target: Path, suffix: str, options: Mapping[str, Any]) -> None:
+    try:
+        write_motion(motion, target, **options)
+    except InputError:
+        raise
+    except KeyError as error:
+        raise InputError(target, "options", f"{error} is no unit or axis of this format") from None
+    except ValueError as error:
+        raise InputError(target, suffix, f"cannot hold {path}: {error}") from None
+
+
+def _check_part(part: str) -> None:
+    if part not in ("estimate", "reference"):
+        raise InputError(_SOURCE, "part", f"must be estimate or reference, not {part!r}")
 
 
 def motion_files(source: Path, part: str, take: str | None) -> dict[str, Path]:
@@ -92,8 +144,6 @@ def motion_files(source: Path, part: str, take: str | None) -> dict[str, Path]:
         raise InputError(source, "path", "no such file or folder")
     if not source.is_dir():
         return {source.name.split(".")[0]: source}
-    if part not in ("estimate", "reference"):
-        raise InputError(_SOURCE, "part", f"must be estimate or reference, not {part!r}")
     takes = {path.parent.name: path for path in sorted(source.glob(f"takes/*/{part}.npz"))}
     if not takes and (source / f"{part}.npz").is_file():
         takes = {source.resolve().name: source / f"{part}.npz"}

@@ -17,7 +17,7 @@ from egopose.humanoid.physics import BatchedPhysics
 from egopose.motion import rotations as rot
 from egopose.motion.rotations import Array
 
-TERMS = ("joints", "bodies", "turn", "rates", "contact", "root", "low", "tremble", "torque", "forbidden")
+TERMS = ("joints", "bodies", "turn", "rates", "contact", "root", "moved", "low", "tremble", "torque", "forbidden")
 _FAR = 0.3  # m: a foot that is this far from where it should stand is as wrong as can be
 _SLACK = 0.1  # m that the head may be below the reference's
 
@@ -33,6 +33,7 @@ class CostWeights:
         rates: of the mean squared difference of the joints' velocities, s^2/rad^2.
         contact: of each foot or hand that touches what it should not, or does not touch what it should.
         root: of the root's squared distance from the reference's, 1/m^2.
+        moved: of the squared distance by which the reference was moved to stand on a world's boxes, 1/m^2.
         low: of metres that the head is too low.
         tremble: of the mean squared acceleration, s^4/rad^2.
         torque: of the mean squared torque, in shares of the limits.
@@ -45,6 +46,7 @@ class CostWeights:
     rates: float
     contact: float
     root: float
+    moved: float
     low: float
     tremble: float
     torque: float
@@ -106,6 +108,7 @@ class MotionCost:
             trust * ((qvel[:, 6:] - reference["qvel"][frame, 6:]) ** 2).mean(axis=1),
             self._contacts(frame, touching, places, wanted_places),
             trust * ((qpos[:, :3] - reference["qpos"][frame, :3] - move) ** 2).sum(axis=1),
+            trust * (move**2).sum(axis=1),
             np.maximum(head - _SLACK, 0.0),
             (((qvel - before) / self._dt) ** 2).mean(axis=1),
             ((physics.torques / self._limits) ** 2).mean(axis=1),

@@ -87,6 +87,7 @@ class FreeBoxes:
         headings: ``[K]`` rad.
         sizes: ``[K, 2]`` m.
         low, high: ``[K, 4]`` the most they can change along and across their heading, in height (m) and yaw (rad).
+        seen: ``[K, 4]`` the change that suits the reference, and ``spread [4]`` how far that may be off.
         needed: ``[K]`` the frame in which a body should come to each; before it a box is drawn anew again and again.
     """
 
@@ -95,6 +96,8 @@ class FreeBoxes:
     sizes: Array
     low: Array
     high: Array
+    seen: Array
+    spread: Array
     needed: NDArray[np.int64]
 
     def placed(self, change: Array) -> tuple[Array, Array]:
@@ -106,8 +109,8 @@ class FreeBoxes:
         return tops, self.headings + change[..., 3]
 
     def drawn(self, rng: np.random.Generator, count: int) -> Array:
-        """``[count, K, 4]`` changes, uniform within their ranges."""
-        return rng.uniform(self.low, self.high, size=(count, *self.low.shape))
+        """``[count, K, 4]`` changes about those that suit the reference, within their ranges."""
+        return np.clip(self.seen + self.spread * rng.normal(size=(count, *self.low.shape)), self.low, self.high)
 
 
 @dataclass(frozen=True)
@@ -171,18 +174,14 @@ class MotionSampler:
         if not self._deviation.any():
             raise InputError("sampling", "deviation", "no key is part of a hinge's name")
         self._rng = np.random.default_rng(settings.seed)
+        self._mean = np.zeros((-(-(len(tracker) - 1) // settings.piece), len(hinges)))
+        self._change: Array | None = None
 
-    def find(self, advance: Callable[[int], None] = lambda _: None) -> Found:
-        """The best motion of all passes; ``advance`` is told frames done."""
-        pieces = -(-(len(self._tracker) - 1) // self.settings.piece)
-        mean = np.zeros((pieces, len(self._deviation)))
-        change: Array | None = None
+    def search(self, passes: range, advance: Callable[[int], None] = lambda _: None) -> Found:
+        """The best motion of some passes, which go on from those before; ``advance`` is told frames done."""
         found = None
-        for number in range(self.settings.passes):
-            deviation = self._deviation * self.settings.narrowing**number
-            # Last with the boxes of the best world alone: only then does the motion play again to the bit.
-            free = 0.0 if number and number == self.settings.passes - 1 else self.settings.narrowing ** (2 * number)
-            found, mean, change = self._pass(mean, deviation, change, free, advance)
+        for number in passes:
+            found = self._pass(number, advance)
         assert found is not None
         return found
 
@@ -190,10 +189,12 @@ class MotionSampler:
         """Stop the physics."""
         self._physics.close()
 
-    def _pass(
-        self, mean: Array, deviation: Array, best: Array | None, free: float, advance: Callable[[int], None]
-    ) -> tuple[Found, Array, Array]:
-        """One pass about offsets ``mean [P, nu]`` and boxes changed by ``best [K, 4]``, ``free`` of their ranges."""
+    def _pass(self, number: int, advance: Callable[[int], None]) -> Found:
+        """One pass about the offsets and boxes of the best world so far."""
+        mean, best = self._mean, self._change
+        deviation = self._deviation * self.settings.narrowing**number
+        # Last with the boxes of the best world alone: only then does the motion play again to the bit.
+        free = 0.0 if number and number == self.settings.passes - 1 else self.settings.narrowing ** (2 * number)
         settings, physics, boxes = self.settings, self._physics, self._boxes
         count, frames = settings.samples, len(self._tracker)
         ways = _Ways(count)
@@ -246,7 +247,8 @@ class MotionSampler:
             tops[winner],
             headings[winner],
         )
-        return Found(motion, terms, change[winner], change[order], total[order]), aims, change[winner]
+        self._mean, self._change = aims, change[winner]
+        return Found(motion, terms, change[winner], change[order], total[order])
 
     def _draw(self, count: int, best: Array | None, free: float) -> Array:
         """``[count, K, 4]`` changes of boxes: anywhere at first, then within ``free`` of the ranges about the best."""

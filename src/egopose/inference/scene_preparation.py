@@ -71,6 +71,8 @@ def prepare_scene(
 
         source, folder = sources.name, store.folder
         told, camera = _of_contacts(scene), _of_camera(scene)
+        given = edited or values["scene"] is not None
+        boxes = [repr(box) for box in scene.boxes] if given else None
         run("poses", inputs["poses"], lambda advance, part: stages.find_poses(values, sources, advance, part))
         run(
             "camera",
@@ -95,14 +97,18 @@ def prepare_scene(
         )
         run(
             "root",
-            {**of("motion.npz", "contacts.npz", "joints.npz", "camera.npz"), "told": told, "camera": camera, **body},
-            lambda _, part: stages.place_root(folder, source, scene, humanoid, part),
+            {
+                **of("motion.npz", "contacts.npz", "joints.npz", "camera.npz"),
+                **{"told": told, "camera": camera, "boxes": boxes},
+                **body,
+            },
+            lambda _, part: stages.place_root(folder, source, scene, given, humanoid, part),
         )
         if not edited:
             run(
                 "scene",
-                {**of("body.npz", "root.npz", "fit.json"), "scene": repr(scene), "given": values["scene"] is not None},
-                lambda _, part: stages.fill_scene(folder, scene, values["scene"] is not None, humanoid, part),
+                {**of("body.npz", "root.npz", "fit.json"), "scene": repr(scene), "given": given},
+                lambda _, part: stages.fill_scene(folder, scene, given, humanoid, part),
             )
         run(
             "page",

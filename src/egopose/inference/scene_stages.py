@@ -16,6 +16,7 @@ from egopose.core.errors import InputError
 from egopose.data.reference import reference_states
 from egopose.humanoid.foot_geometry import sole_positions
 from egopose.humanoid.model import HumanoidModel
+from egopose.motion import rotations as rot
 from egopose.motion.contacts import without_short_runs
 from egopose.motion.io._npz import entry_names, read_arrays
 from egopose.motion.io.native import read_native, write_native
@@ -25,6 +26,7 @@ from egopose.scene.articulation import articulated
 from egopose.scene.camera import CameraTrack, camera_motion
 from egopose.scene.camera_file import given_camera, load_camera, save_camera
 from egopose.scene.contacts import FEET, LOWER_BODY, ContactNetwork, estimate_contacts
+from egopose.scene.footholds import on_footholds
 from egopose.scene.lifting import LiftingNetwork, lifted_track
 from egopose.scene.poses.blazepose import BlazePose
 from egopose.scene.poses.keypoints import BODY_25, HUMANOID_JOINTS
@@ -34,9 +36,18 @@ from egopose.scene.poses.sides import mend_sides
 from egopose.scene.poses.timing import cut, known_span, resampled
 from egopose.scene.poses.track import PoseTrack, load_track
 from egopose.scene.projection import Projection, fit_projection
-from egopose.scene.root import KinematicRoot, RootSettings, SeenPlaces, Support, kinematic_root
+from egopose.scene.root import KinematicRoot, RootSettings, SeenPlaces, Support, kinematic_root, on_supports
 from egopose.scene.scene_file import Scene, write_scene
-from egopose.scene.supports import filled_scene, floor_height, levels, matched, told_contacts, touched
+from egopose.scene.supports import (
+    Level,
+    filled_scene,
+    floor_height,
+    level_heights,
+    levels,
+    matched,
+    told_contacts,
+    touched,
+)
 from egopose.scene.upright import first_to_world, focal_length, orientation, view_turns
 from egopose.vision.video import Frame, iter_frames, probe_video
 
@@ -156,6 +167,15 @@ def clip_of(folder: Path) -> tuple[int, int]:
     return int(card["start"]), int(card["stop"])
 
 
+def film_of(folder: Path) -> Path | None:
+    """Where the film was; None where there was none, or it is gone."""
+    try:
+        video = json.loads((folder / "clip.json").read_text()).get("video")
+    except (OSError, ValueError):
+        return None
+    return Path(video) if isinstance(video, str) and Path(video).is_file() else None
+
+
 def clip_camera(folder: Path) -> CameraTrack:
     """The camera over the clip's frames, still against the film's first picture."""
     camera, part = load_camera(folder / "camera.npz"), slice(*clip_of(folder))
@@ -233,53 +253,70 @@ def _held(values: Array) -> Array:
     return flat.reshape(values.shape)
 
 
-def place_root(folder: Path, source: Path, scene: Scene, humanoid: HumanoidModel, out: Path) -> None:
-    """``body.npz``: the motion in the world, floor at 0; ``root.npz``: supports; ``projection.npz``: to the film."""
+def place_root(folder: Path, source: Path, scene: Scene, given: bool, humanoid: HumanoidModel, out: Path) -> None:
+    """``body.npz``: the motion in the world, floor at 0; ``root.npz``: supports; ``projection.npz``: to the film.
+
+    Where a scene is ``given``, feet stand on its floor and boxes alone.
+    """
     motion, touching = read_native(folder / "motion.npz"), touching_of(folder, scene)
     if not touching.any():
         raise InputError(source, "contacts", "no foot touches anything: say which frames do in the scene file")
-    root, focal = _seen_root(folder, motion, touching, humanoid, scene)
+    root, seen, focal = _seen_root(folder, motion, touching, humanoid, scene)
+    feet, com = _about_pelvis(motion, humanoid)
     floor = floor_height(root.supports, touched(scene, root.supports))
+    on = _levels(scene, given, root, feet, floor, motion)
+    heights = level_heights(root.supports, floor, on)
+    supports = tuple(replace(s, height=height) for s, height in zip(root.supports, heights, strict=True))
+    root = on_supports(replace(root, supports=supports), feet, com, motion.fps, _ROOT, seen)
     qpos = motion.qpos.copy()
     qpos[:, :3] = root.positions - [0.0, 0.0, floor]
+    stands = [replace(s, height=s.height - floor) for s in supports]
+    body = on_footholds(humanoid, replace(motion, qpos=qpos), stands, trust_of(folder))
     names = tuple(f"{side.capitalize()}Foot" for side in FEET)
-    body = replace(motion, qpos=qpos, contacts=touching, contact_names=names)
+    body = replace(body, contacts=touching, contact_names=names)
     write_native(body, out / "body.npz")
-    rows = np.array([[s.foot, s.start, s.stop, s.height - floor] for s in root.supports])
+    rows = np.array([[s.foot, s.start, s.stop, s.height] for s in stands])
     np.savez_compressed(out / "root.npz", supports=rows, flight=root.flight)
     save_projection(_projection(folder, body), out / "projection.npz")
     (out / "lens.json").write_text(json.dumps({"focal_px": focal}))
 
 
-def _root(
-    folder: Path, motion: Motion, touching: NDArray[np.bool_], humanoid: HumanoidModel, seen: SeenPlaces | None
-) -> KinematicRoot:
-    """Of poses anywhere."""
+def _levels(scene: Scene, given: bool, root: KinematicRoot, feet: Array, floor: float, motion: Motion) -> list[Level]:
+    """What the body stands on beside the floor; ``feet`` about the pelvis."""
+    soles = (root.positions[:, None, None] + feet).mean(axis=2)[..., :2]
+    touches: list[str | None] = touched(scene, root.supports)
+    if given:
+        touches = [*matched(scene, root.supports, touches, floor, soles)]
+    return levels(root.supports, touches, floor, soles, rot.yaw(motion.qpos[:, 3:7]))
+
+
+def _about_pelvis(motion: Motion, humanoid: HumanoidModel) -> tuple[Array, Array]:
+    """Soles ``[T, 2, 2, 3]`` and centre of mass ``[T, 3]``, m, relative to the pelvis."""
     pelvis = motion.qpos[:, :3]
-    feet = sole_points(humanoid, motion) - pelvis[:, None, None]
     com = reference_states(humanoid, motion)["com"].numpy() - pelvis
-    return kinematic_root(feet, touching, com, motion.fps, _ROOT, seen)
+    return sole_points(humanoid, motion) - pelvis[:, None, None], com
 
 
 def _seen_root(
     folder: Path, motion: Motion, touching: NDArray[np.bool_], humanoid: HumanoidModel, scene: Scene
-) -> tuple[KinematicRoot, float | None]:
-    """The root by feet, gravity and pictures, and the focal length (px) with which they go together best.
+) -> tuple[KinematicRoot, SeenPlaces | None, float | None]:
+    """The root by feet, gravity and pictures; what pictures tell, with the focal length (px) that suits them best.
 
     A camera that travels tells nothing: the root is by feet and gravity, and there is no focal length.
     """
+    feet, com = _about_pelvis(motion, humanoid)
     track = load_track(folder / "joints.npz")
     size, pelvis = track.image_size, track.pixels[:, BODY_25.index("mid_hip")]
     if size is None or camera_moves(folder, scene) == "track" or not np.isfinite(pelvis).any():
-        return _root(folder, motion, touching, humanoid, None), None
+        return kinematic_root(feet, touching, com, motion.fps, _ROOT), None, None
     usual = focal_length(size, scene.camera.field_of_view)
-    factors = _LENSES if scene.camera.field_of_view is None else (1.0,)
     found = []
-    for factor in factors:
-        root = _root(folder, motion, touching, humanoid, _seen_places(folder, motion, scene, factor * usual))
-        found.append((root.misfit + (np.log(factor) / _LENS) ** 2, factor, root))
-    _, factor, root = min(found, key=lambda one: one[0])
-    return root, factor * usual
+    for factor in _LENSES if scene.camera.field_of_view is None else (1.0,):
+        seen = _seen_places(folder, motion, scene, factor * usual)
+        root = kinematic_root(feet, touching, com, motion.fps, _ROOT, seen)
+        found.append((root.misfit + (np.log(factor) / _LENS) ** 2, factor * usual, root, seen))
+    _, focal, root, seen = min(found, key=lambda one: one[0])
+    return root, seen, focal
 
 
 def _seen_places(folder: Path, motion: Motion, scene: Scene, focal: float) -> SeenPlaces:
@@ -343,12 +380,10 @@ def fill_scene(folder: Path, scene: Scene, given: bool, humanoid: HumanoidModel,
     """``scene.yaml``: the scene with what it left out. Boxes are proposed only where no scene was ``given``."""
     body, supports = read_native(folder / "body.npz"), supports_of(folder)
     soles = sole_points(humanoid, body).mean(axis=2)[..., :2]
-    heading = body.qpos[:, 3:7]
-    yaws = 2 * np.arctan2(heading[:, 3], heading[:, 0])
     touches: list[str | None] = touched(scene, supports)
     if given:
         touches = [*matched(scene, supports, touches, 0.0, soles)]
-    on = levels(supports, touches, 0.0, soles, np.arctan2(np.sin(yaws), np.cos(yaws)))
+    on = levels(supports, touches, 0.0, soles, rot.yaw(body.qpos[:, 3:7]))
     filled = filled_scene(scene, supports, touches, on)
     fit = json.loads((folder / "fit.json").read_text())
     camera = replace(filled.camera, motion=fit["camera"])

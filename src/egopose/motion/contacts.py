@@ -60,8 +60,13 @@ def without_short_runs(labels: NDArray[np.bool_], min_frames: int) -> NDArray[np
     """Runs of True shorter than ``min_frames`` become False, save those the clip's ends may have cut."""
     out = labels.copy()
     for k in range(labels.shape[1]):
-        edges = np.flatnonzero(np.diff(np.concatenate([[False], labels[:, k], [False]]).astype(np.int8)))
-        for start, stop in zip(edges[::2], edges[1::2], strict=True):
+        for start, stop in runs_of(labels[:, k]):
             if stop - start < min_frames and start > 0 and stop < len(labels):
                 out[start:stop, k] = False
     return out
+
+
+def runs_of(mask: np.ndarray) -> tuple[tuple[int, int], ...]:
+    """``[start, stop)`` of every run of True in a boolean array ``[T]``."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], np.asarray(mask, dtype=np.int8), [0]])))
+    return tuple((int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True))

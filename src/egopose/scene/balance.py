@@ -81,8 +81,9 @@ def lean(
     return np.column_stack([-moved[:, 1], moved[:, 0], np.zeros(frames)])
 
 
-def leaned(qpos: Array, turn: Array) -> Array:
-    """Poses ``[T, nq]`` whose roots are turned by ``turn [T, 3]`` (rad, world axes); the root's place stays."""
-    out = qpos.copy()
-    out[:, 3:7] = rot.multiply(rot.from_rotvec(turn), qpos[:, 3:7])
+def leaned(qpos: Array, turn: Array, pivot: Array) -> Array:
+    """Poses ``[T, nq]`` turned as a whole by ``turn [T, 3]`` (rad, world axes) about ``pivot [T, 3]`` (m)."""
+    out, by = qpos.copy(), rot.from_rotvec(turn)
+    out[:, :3] = pivot + rot.rotate(by, qpos[:, :3] - pivot)
+    out[:, 3:7] = rot.multiply(by, qpos[:, 3:7])
     return out

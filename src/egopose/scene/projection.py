@@ -31,6 +31,25 @@ class Projection:
         return Projection(self.matrix[t : t + 1], self.origin[t : t + 1])
 
 
+def camera_poses(projection: Projection, points: Array, focal: float) -> tuple[Array, Array]:
+    """Where a camera stood and how it was turned, if it looked straight at the body.
+
+    Args:
+        projection: of ``T`` frames.
+        points: ``[T, 3]`` m, what it looks at: a root.
+        focal: px, its focal length.
+
+    Returns:
+        Places ``[T, 3]`` m, as far away as the body's size in the picture says, and ``[T, 3, 3]``: the picture's right,
+        down and ahead as rows, world axes.
+    """
+    length = np.linalg.norm(projection.matrix, axis=2)
+    right, down = (projection.matrix[:, k] / length[:, k, None] for k in (0, 1))
+    ahead = np.cross(right, down)
+    distance = focal / np.sqrt(length[:, 0] * length[:, 1])
+    return points - distance[:, None] * ahead, np.stack([right, down, ahead], axis=1)
+
+
 def fit_projection(points: Array, pixels: Array, weight: Array, to_world: Array, fps: float) -> Projection:
     """The projection that puts points of the body onto their pixels.
 

@@ -10,7 +10,7 @@ what happens while no foot touches anything, such as how far a body falls.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -81,12 +81,14 @@ class KinematicRoot:
         positions: ``[T, 3]`` m of the pelvis.
         supports: in order of time.
         flight: ``[T]`` whether the body flies.
+        camera: ``[3]`` m, the camera's place; empty where pictures tell nothing.
         misfit: sum of the squared residuals: how ill feet, gravity and pictures go together.
     """
 
     positions: Array
     supports: tuple[Support, ...]
     flight: NDArray[np.bool_]
+    camera: Array
     misfit: float
 
 
@@ -159,9 +161,44 @@ def kinematic_root(
     positions, camera, misfit = _least_squares(steps, firmness, flight, center_of_mass, seen, fps, settings)
     lowest = positions[:, None, 2] + feet[..., 2].min(axis=2)
     supports = _levelled(lowest, contacts, settings)
-    rows = None if seen is None else _seen_heights(seen, positions, camera, settings)
-    positions = _on_supports(positions, lowest, supports, flight, center_of_mass, rows, fps, settings)
-    return KinematicRoot(positions - [*positions[0, :2], 0.0], supports, flight, misfit)
+    root = KinematicRoot(positions, supports, flight, camera, misfit)
+    root = on_supports(root, feet, center_of_mass, fps, settings, seen)
+    start = np.array([*root.positions[0, :2], 0.0])
+    return replace(root, positions=root.positions - start, camera=camera - start if len(camera) else camera)
+
+
+def on_supports(
+    root: KinematicRoot,
+    feet: Array,
+    center_of_mass: Array,
+    fps: float,
+    settings: RootSettings,
+    seen: SeenPlaces | None = None,
+) -> KinematicRoot:
+    """The root with the heights solved again, so that feet stand at their supports' heights.
+
+    Args:
+        root: its supports may have got other heights than :func:`kinematic_root` gave them.
+        feet, center_of_mass, fps, settings, seen: as there.
+    """
+    positions, frames = root.positions, len(root.positions)
+    lowest = positions[:, None, 2] + feet[..., 2].min(axis=2)
+    weight, wanted = np.zeros(frames), np.zeros(frames)
+    for support in root.supports:
+        span = slice(support.start, support.stop)
+        weight[span] += 1.0
+        wanted[span] += support.height - (lowest[span, support.foot] - positions[span, 2])
+    bend, target = _bending(root.flight, center_of_mass, fps, settings)
+    stand = weight / settings.sole**2
+    normal = bend.T @ bend + sparse.diags_array(stand) + 1e-9 * sparse.eye_array(frames)
+    right = bend.T @ target[:, 2] + stand * wanted / np.maximum(weight, 1.0)
+    if seen is not None and len(root.camera):
+        factor, value = _seen_heights(seen, positions, root.camera, settings)
+        normal = normal + sparse.diags_array((factor**2).sum(axis=1))
+        right = right + (factor * value).sum(axis=1)
+    out = positions.copy()
+    out[:, 2] = sparse.linalg.spsolve(normal.tocsc(), right)
+    return replace(root, positions=out)
 
 
 def _moving(steps: Array, seen: SeenPlaces | None, fps: float, settings: RootSettings) -> NDArray[np.bool_]:
@@ -340,36 +377,6 @@ def _levelled(lowest: Array, contacts: np.ndarray, settings: RootSettings) -> tu
             height = 0.0
         found.append(Support(foot, start, stop, height))
     return tuple(found)
-
-
-def _on_supports(
-    positions: Array,
-    lowest: Array,
-    supports: tuple[Support, ...],
-    flight: NDArray[np.bool_],
-    center_of_mass: Array,
-    seen: tuple[Array, Array] | None,
-    fps: float,
-    settings: RootSettings,
-) -> Array:
-    """The positions with the heights solved again, so that feet stand at their supports' heights."""
-    frames = len(positions)
-    weight, wanted = np.zeros(frames), np.zeros(frames)
-    for support in supports:
-        span = slice(support.start, support.stop)
-        weight[span] += 1.0
-        wanted[span] += support.height - (lowest[span, support.foot] - positions[span, 2])
-    bend, target = _bending(flight, center_of_mass, fps, settings)
-    stand = weight / settings.sole**2
-    normal = bend.T @ bend + sparse.diags_array(stand) + 1e-9 * sparse.eye_array(frames)
-    right = bend.T @ target[:, 2] + stand * wanted / np.maximum(weight, 1.0)
-    if seen is not None:
-        factor, value = seen
-        normal = normal + sparse.diags_array((factor**2).sum(axis=1))
-        right = right + (factor * value).sum(axis=1)
-    out = positions.copy()
-    out[:, 2] = sparse.linalg.spsolve(normal.tocsc(), right)
-    return out
 
 
 def _runs(mask: np.ndarray) -> list[tuple[int, int]]:

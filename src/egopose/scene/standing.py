@@ -47,10 +47,14 @@ class Standing:
         return self.surfaces(tops) @ self.share.T
 
     def moves(self, tops: Array, headings: Array, sizes: Array) -> Array:
-        """``[n, T, 3]`` m: how far the motion is to be moved.
+        """``[n, T, 3]`` m: how far the motion is to be moved; see :meth:`moves_of_supports`."""
+        return np.einsum("ts,nsd->ntd", self.share, self.moves_of_supports(tops, headings, sizes))
 
-        Vertically by the height of what it stands on less that at which its foot stood. Level by what brings the foot
-        onto the box's upper face, and no further.
+    def moves_of_supports(self, tops: Array, headings: Array, sizes: Array) -> Array:
+        """``[n, S, 3]`` m: how far each support is to be moved.
+
+        Vertically by the height of what it is on less that at which the motion's foot stood. Level by what brings the
+        foot onto the box's upper face, and no further.
 
         Args:
             tops: ``[n, K, 3]`` m, centres of the upper faces.
@@ -70,7 +74,7 @@ class Standing:
             back = np.clip(along, -room[:, 0], room[:, 0]) - along
             side = np.clip(across, -room[:, 1], room[:, 1]) - across
             out[:, on, 0], out[:, on, 1] = cos * back - sin * side, sin * back + cos * side
-        return np.einsum("ts,nsd->ntd", self.share, out)
+        return out
 
     def _of_box(self, tops: Array) -> Array:
         return tops[:, np.maximum(self.box, 0)] if tops.shape[1] else np.zeros((len(tops), len(self.box), 3))

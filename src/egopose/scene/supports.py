@@ -118,6 +118,21 @@ def matched(
     return out
 
 
+def level_heights(supports: Sequence[Support], floor: float, on: Sequence[Level]) -> list[float]:
+    """The height (m) of what each support is on, one for the floor and one for each thing.
+
+    Args:
+        supports: of the kinematic root.
+        floor: m, of :func:`floor_height`.
+        on: of :func:`levels`: supports on one thing.
+    """
+    out = [floor] * len(supports)
+    for level in on:
+        for k in level.supports:
+            out[k] = floor + level.height
+    return out
+
+
 def _in_box(box: Box, place: Array) -> Array:
     """``[2]`` m, in the box's own axes from the middle of its upper face."""
     yaw = box.yaw or 0.0

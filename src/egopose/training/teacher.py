@@ -19,7 +19,7 @@ from egopose.humanoid.derivatives import Simulator, Single, state_difference
 from egopose.humanoid.inverse_dynamics import ForceSettings, with_forces
 from egopose.humanoid.model import HumanoidModel
 from egopose.humanoid.physics_worker import Placer
-from egopose.humanoid.trajectory import Followed, Nominal, TrackingCost, TrajectoryOptimiser, feed_forward
+from egopose.humanoid.trajectory import Followed, Nominal, TrackingCost, TrajectoryOptimiser, feed_forward, shifted
 from egopose.motion.motion import Motion, finite_difference
 from egopose.motion.rotations import Array
 
@@ -166,7 +166,7 @@ def teach(
         followed = bodies.followed(humanoid)
         nominal = optimiser.simulate(bodies.qpos, bodies.qvel, followed)
         if bodies.plan is not None:
-            older = _shifted(bodies.plan, followed, settings.every)
+            older = shifted(bodies.plan, followed, settings.every)
             gains = np.concatenate([bodies.gains[:, settings.every :], 0 * bodies.gains[:, : settings.every]], axis=1)
             kept = optimiser.simulate(bodies.qpos, bodies.qvel, followed, older, gains=gains)
             kept.cost[bodies.fresh] = np.inf
@@ -187,17 +187,6 @@ def teach(
             bodies.qpos, bodies.qvel = simulator.step(bodies.qpos, bodies.qvel, ctrl)
         lost += bodies.advance(humanoid)
     return Lessons.joined(lessons), lost
-
-
-def _shifted(plan: Nominal, followed: Followed, by: int) -> Nominal:
-    """A plan ``by`` frames later: what follows its end is the feed-forward about the motion itself."""
-    kept = plan.ctrl.shape[1] - by
-    return Nominal(
-        np.concatenate([plan.qpos[:, by:-1], followed.qpos[:, kept:]], axis=1),
-        np.concatenate([plan.qvel[:, by:-1], followed.qvel[:, kept:]], axis=1),
-        np.concatenate([plan.ctrl[:, by:], followed.ctrl[:, kept:]], axis=1),
-        plan.cost,
-    )
 
 
 class _Bodies:

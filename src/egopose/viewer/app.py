@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import queue
-import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -15,9 +12,9 @@ from egopose.viewer.auth_proxy import Address
 from egopose.viewer.charts import Chart
 from egopose.viewer.clip import Clip, Footage, Run
 from egopose.viewer.figure import Color, Figure
-from egopose.viewer.player import Player
-from egopose.viewer.serving import furnish, open_server, tile
+from egopose.viewer.serving import furnish, tile
 from egopose.viewer.sync_panel import SyncPanel
+from egopose.viewer.timeline import TimelineViewer
 from egopose.viewer.video_panel import Pictures
 
 _MAIN: Color = (70, 110, 220)
@@ -26,11 +23,10 @@ _REFERENCE: Color = (60, 190, 90)
 _DRAWN: Color = (170, 80, 200)
 _STEPS = ((12, 0.4), (24, 0.26), (45, 0.15))  # frames ahead and opacity: a forecast's poses to come
 _NONE = "none"
-_TICK, _CHARTS_EVERY = 1 / 30, 3  # s between pictures; charts and slider follow at a third of that
 _SPEEDS = ("0.1", "0.25", "0.5", "1", "2", "4")
 
 
-class Viewer:
+class Viewer(TimelineViewer):
     """Serves until :meth:`close`.
 
     Args:
@@ -47,31 +43,12 @@ class Viewer:
         self, runs: Sequence[Run], address: Address, find_sync: bool = False, overrides: Sequence[str] = ()
     ) -> None:
         self._runs = {run.label: run for run in runs}
-        self._server, self._door, self.url = open_server(address)
-        self._player = Player()
-        self._asked: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
         self._figures: dict[str, Figure] = {}
         self._trail: list[tuple[Figure, int]] = []
-        self._pictures: Pictures | None = None
-        self._build(overrides)
-        # Here and not on the thread: the first figure reads conf/humanoid, and Hydra composes for one thread at a time.
-        self._load()
-        if find_sync:
-            self._sync.find()
-        self._stop = threading.Event()
-        self._thread = threading.Thread(target=self._loop, daemon=True)
-        self._thread.start()
+        self._find_sync, self._overrides = find_sync, overrides
+        super().__init__(address)
 
-    def close(self) -> None:
-        """Serve no more."""
-        self._stop.set()
-        self._thread.join()
-        if self._pictures is not None:
-            self._pictures.close()
-        self._door.close()
-        self._server.stop()
-
-    def _build(self, overrides: Sequence[str]) -> None:
+    def _build(self) -> None:
         gui = self._server.gui
         self._world, self._floor = furnish(self._server)
         labels = list(self._runs)
@@ -79,12 +56,11 @@ class Viewer:
         self._compare = gui.add_dropdown("Compare", [_NONE, *labels], initial_value=_NONE, visible=len(labels) > 1)
         takes = list(self._runs[labels[0]].clips)
         self._take: Any = gui.add_dropdown("Take", takes, initial_value=takes[0])
-        self._frame: Any = gui.add_slider("Frame", 0, 1, 1, 0)
-        self._play = gui.add_button("Play")
+        self._add_timeline()
         self._speed = gui.add_dropdown("Speed", _SPEEDS, initial_value="1")
         self._status = gui.add_markdown("")
         self._video = gui.add_image(np.zeros((2, 2, 3), np.uint8), label="Wearer's video", visible=False)
-        self._sync = SyncPanel(gui, self._asked.put, self._move_video, overrides)
+        self._sync = SyncPanel(gui, self._asked.put, self._move_video, self._overrides)
         self._value = Chart(gui, "Value V(s)")
         self._confidence = Chart(gui, "Fail-safe: confidence, resets")
         self._errors = gui.add_dropdown("Figure", [_NONE], initial_value=_NONE, visible=False)
@@ -96,41 +72,16 @@ class Viewer:
             self._follow = gui.add_checkbox("follow", True)
             self._again = gui.add_checkbox("loop", True)
 
-        def on(handle: Any, action: Callable[[], None]) -> None:
-            # Values set from here call back too; only what a browser asked for is an order. All orders are carried
-            # out by one thread, the one that draws.
-            @handle.on_update
-            def _(event: Any) -> None:
-                if event.client is not None:
-                    self._asked.put(action)
-
-        on(self._run, self._choose_run)
-        on(self._compare, self._load)
-        on(self._take, self._load)
-
-        @self._frame.on_update
-        def _(event: Any) -> None:
-            if event.client is not None:
-                self._asked.put(partial(self._scrub, int(event.target.value)))
-
-        on(self._speed, lambda: setattr(self._player, "speed", float(self._speed.value)))
-        on(self._errors, self._chart_error)
-        on(self._degrees, self._chart_angle)
-        on(self._again, lambda: setattr(self._player, "loop", self._again.value))
-        self._play.on_click(lambda _: self._asked.put(lambda: self._player.play(not self._player.playing)))
-
-    def _loop(self) -> None:
-        ticks, shown = 0, (-1, False)
-        while not self._stop.wait(_TICK):
-            changed = False
-            while not self._asked.empty():
-                self._asked.get()()
-                changed = True
-            now = (self._player.frame(), self._player.playing)
-            ticks += 1
-            if now != shown or changed or ticks % 30 == 0:
-                self._draw(now[0], slow=changed or not now[1] or ticks % _CHARTS_EVERY == 0)
-            shown = now
+        self._on(self._run, self._choose_run)
+        self._on(self._compare, self._load)
+        self._on(self._take, self._load)
+        self._on(self._speed, lambda: setattr(self._player, "speed", float(self._speed.value)))
+        self._on(self._errors, self._chart_error)
+        self._on(self._degrees, self._chart_angle)
+        self._on(self._again, lambda: setattr(self._player, "loop", self._again.value))
+        self._load()
+        if self._find_sync:
+            self._sync.find()
 
     def _clips(self) -> list[tuple[str, Clip, Color]]:
         """The run shown and the one it is compared with, where both have the take."""
@@ -148,10 +99,6 @@ class Viewer:
         self._take.options = takes
         self._take.value = kept
         self._load()
-
-    def _scrub(self, frame: int) -> None:
-        self._player.play(False)
-        self._player.seek(frame)
 
     def _load(self) -> None:
         """Put the chosen clips into the scene, from their first frame on."""
@@ -173,9 +120,7 @@ class Viewer:
         ]
         self._show_video(main, main.footage)
         self._sync.load(main)
-        self._player.load(len(main.motion), main.motion.fps)
-        self._frame.value = 0
-        self._frame.max = max(1, len(main.motion) - 1)
+        self._load_timeline(len(main.motion), main.motion.fps)
         self._charts(clips)
 
     def _show_video(self, clip: Clip, footage: Footage | None) -> None:
@@ -248,8 +193,7 @@ class Viewer:
             self._video.image = picture
         if not slow:
             return
-        self._frame.value = frame
-        self._play.label = "Pause" if self._player.playing else "Play"
+        self._show_timeline(frame)
         self._status.content = self._line(frame, clips)
         for marked in (self._value, self._confidence, self._error, self._angle, self._sync):
             marked.at(frame)

@@ -93,13 +93,18 @@ class _Torques:
 
 
 class _Touch:
-    """A ball on the ground below every joint that a touching point is named after, or below the lowest joints."""
+    """A disc on the ground below every joint that a touching point is named after.
+
+    It lies at the centre of pressure where the motion's ground reaction names the same bodies: they may be on a box.
+    """
 
     def __init__(self, scene: viser.SceneApi, name: str, motion: Motion) -> None:
         assert motion.contacts is not None
         joints = [_joint_of(label, motion.skeleton.names) for label in motion.contact_names]
         known = [(k, j) for k, j in enumerate(joints) if j is not None]
         self._contacts = motion.contacts
+        ground = motion.ground_reaction
+        self._points = ground.point if ground is not None and ground.bodies == motion.contact_names else None
         self._columns, self._joints = [k for k, _ in known], [j for _, j in known]
         ball = trimesh.creation.icosphere(1, radius=0.07).apply_scale([1.6, 1.6, 0.15])
         count = max(1, len(known))
@@ -112,6 +117,8 @@ class _Touch:
         self._discs.visible = visible and bool(self._joints)
         if self._joints:
             ground = positions[self._joints] * [1, 1, 0]
+            if self._points is not None:
+                ground = self._points[frame, self._columns]
             self._discs.batched_positions = ground.astype(np.float32)
             self._discs.batched_scales = self._contacts[frame, self._columns].astype(np.float32)
 

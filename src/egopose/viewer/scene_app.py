@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-import json
-import queue
-import threading
 from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from egopose.core.errors import InputError
-from egopose.inference.scene_stages import load_projection
+from egopose.inference.scene_stages import film_of, load_projection
 from egopose.motion.io.native import read_native
 from egopose.scene.drawing import body_points, draw_bones, draw_box
 from egopose.scene.edits import add_box, remove_box, remove_contact, with_box, with_contact
@@ -22,19 +18,18 @@ from egopose.scene.scene_file import EFFECTORS, FLOOR, Box, Contact, read_scene,
 from egopose.viewer.auth_proxy import Address
 from egopose.viewer.clip import Footage
 from egopose.viewer.figure import Figure
-from egopose.viewer.player import Player
-from egopose.viewer.serving import furnish, open_server
+from egopose.viewer.serving import furnish
+from egopose.viewer.timeline import TimelineViewer
 from egopose.viewer.video_panel import Pictures
 from egopose.vision.video import probe_video
 
 _BODY, _BOX, _CHOSEN = (70, 110, 220), (200, 160, 90), (240, 170, 40)
-_TICK = 1 / 30
 _NONE = "none"
 _VALUES = ("x (m)", "y (m)", "height (m)", "length (m)", "width (m)", "yaw (degrees)")
 
 
-class SceneViewer:
-    """Serves until :meth:`close`.
+class SceneViewer(TimelineViewer):
+    """Serves until :meth:`close`; what was not saved then is lost.
 
     Args:
         folder: of the results of `egopose reconstruct prepare`.
@@ -54,42 +49,24 @@ class SceneViewer:
         self.scene = read_scene(folder / "scene.yaml")
         self._body = read_native(folder / "body.npz")
         self._projection = load_projection(folder / "projection.npz")
-        film = _film(folder) if video is None else video
-        self._pictures, self._width = None, 1
-        if film is not None:
-            self._width = probe_video(film).width
-            self._pictures = Pictures(Footage(film, start=self.scene.begin), self._body.fps, len(self._body))
+        self._film = film_of(folder) if video is None else video
+        self._width = 1 if self._film is None else probe_video(self._film).width
         points, self._parents = body_points(self._body)
         self._places = self._projection.pixels(points)
-        self._server, self._door, self.url = open_server(address)
-        self._player = Player()
-        self._player.load(len(self._body), self._body.fps)
-        self._asked: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
         self._boxes: dict[str, Any] = {}
-        self._build()
-        self._show_scene()
-        self._stop = threading.Event()
-        self._thread = threading.Thread(target=self._loop, daemon=True)
-        self._thread.start()
-
-    def close(self) -> None:
-        """Serve no more; what was not saved is lost."""
-        self._stop.set()
-        self._thread.join()
-        if self._pictures is not None:
-            self._pictures.close()
-        self._door.close()
-        self._server.stop()
+        super().__init__(address)
 
     def _build(self) -> None:
         gui = self._server.gui
         furnish(self._server)
+        if self._film is not None:
+            self._pictures = Pictures(Footage(self._film, start=self.scene.begin), self._body.fps, len(self._body))
         self._figure = Figure(self._server.scene, "/world/body", self._body, _BODY, marks=True)
         x, y, z = self._body.qpos[0, :3].tolist()
         self._server.initial_camera.position = (x, y - 5.0, z + 1.0)
         self._server.initial_camera.look_at = (x, y, z - 0.5)
-        self._frame: Any = gui.add_slider("Frame", 0, max(1, len(self._body) - 1), 1, 0)
-        self._play = gui.add_button("Play")
+        self._add_timeline()
+        self._load_timeline(len(self._body), self._body.fps)
         self._video = gui.add_image(np.zeros((2, 2, 3), np.uint8), label="The film", visible=self._pictures is not None)
         with gui.add_folder("Boxes"):
             self._box: Any = gui.add_dropdown("Box", [_NONE])
@@ -106,27 +83,15 @@ class SceneViewer:
         self._save = gui.add_button("Save", color="green")
         self._said = gui.add_markdown("")
 
-        def asked(handle: Any, action: Callable[[], None]) -> None:
-            # Values set from here call back too; only what a browser asked for is an order.
-            @handle.on_update
-            def _(event: Any) -> None:
-                if event.client is not None:
-                    self._asked.put(action)
-
         for handle in self._values.values():
-            asked(handle, self.set_box)
-        asked(self._box, self._show_scene)
-        asked(self._row, self._show_row)
-        asked(self._frame, lambda: self._seek(int(self._frame.value)))
-        self._play.on_click(lambda _: self._asked.put(lambda: self._player.play(not self._player.playing)))
+            self._on(handle, self.set_box)
+        self._on(self._box, self._show_scene)
+        self._on(self._row, self._show_row)
         actions = [(self._add, self.add_box), (self._remove, self.remove_box), (self._save, self.save)]
         actions += [(self._set, self.set_contact), (self._drop, self.remove_contact)]
         for button, action in actions:
-            button.on_click(partial(self._ask, action))
-
-    def _ask(self, action: Callable[[], None], _: Any) -> None:
-        """All orders are carried out by one thread, the one that draws."""
-        self._asked.put(action)
+            self._on_click(button, action)
+        self._show_scene()
 
     def add_box(self) -> None:
         """A new box below the body."""
@@ -186,10 +151,6 @@ class SceneViewer:
         self._said.content = "changed, not saved"
         self._show_scene()
 
-    def _seek(self, frame: int) -> None:
-        self._player.play(False)
-        self._player.seek(frame)
-
     def _show_scene(self, chosen: str | None = None) -> None:
         """The scene in the panel and among the shapes."""
         names = [box.name for box in self.scene.boxes]
@@ -236,23 +197,10 @@ class SceneViewer:
             position=(*box.place, height / 2),
         )
 
-    def _loop(self) -> None:
-        shown, scene, ticks = (-1, False), self.scene, 0
-        while not self._stop.wait(_TICK):
-            while not self._asked.empty():
-                self._asked.get()()
-            ticks += 1
-            now = (self._player.frame(), self._player.playing)
-            # Pictures that come in late are shown with the next second's look.
-            if now != shown or scene is not self.scene or ticks % 30 == 0:
-                self._draw(*now)
-                shown, scene = now, self.scene
-
-    def _draw(self, frame: int, playing: bool) -> None:
+    def _draw(self, frame: int, slow: bool) -> None:
         with self._server.atomic():
             self._figure.show(frame)
-        self._frame.value = frame
-        self._play.label = "Pause" if playing else "Play"
+        self._show_timeline(frame)
         picture = None if self._pictures is None else self._pictures.at(frame)
         if picture is not None:
             scale = picture.shape[1] / self._width
@@ -266,12 +214,3 @@ class SceneViewer:
 def is_scene_folder(path: Path) -> bool:
     """Whether a folder holds results of `egopose reconstruct prepare`."""
     return all((path / name).is_file() for name in ("scene.yaml", "body.npz", "projection.npz"))
-
-
-def _film(folder: Path) -> Path | None:
-    """Where the film was; None where there was none, or it is gone."""
-    try:
-        video = json.loads((folder / "clip.json").read_text()).get("video")
-    except (OSError, ValueError):
-        return None
-    return Path(video) if isinstance(video, str) and Path(video).is_file() else None

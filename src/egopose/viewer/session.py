@@ -10,6 +10,7 @@ from pathlib import Path
 
 from egopose.core.config import compose_config
 from egopose.core.errors import InputError
+from egopose.inference.reconstruction import reconstruction_folder, simulated_humanoid
 from egopose.motion.io import given_options
 from egopose.motion.notes import tell_notes
 from egopose.motion.plausibility import source_findings, tell
@@ -18,7 +19,9 @@ from egopose.viewer.auth_proxy import Address
 from egopose.viewer.clip import Footage
 from egopose.viewer.clip_sources import read_runs
 from egopose.viewer.live import LiveViewer
+from egopose.viewer.reconstruction_app import ReconstructionViewer
 from egopose.viewer.scene_app import SceneViewer, is_scene_folder
+from egopose.viewer.timeline import TimelineViewer
 from egopose.vision.video import probe_video
 
 _LIVE = ("ws://", "wss://")
@@ -30,8 +33,14 @@ def is_source(word: str) -> bool:
 
 
 def open_viewer(
-    words: Sequence[str], video: Path | None, offset: float | None, address: str, port: int, token: str | None
-) -> Viewer | LiveViewer | SceneViewer:
+    words: Sequence[str],
+    video: Path | None,
+    offset: float | None,
+    address: str,
+    port: int,
+    token: str | None,
+    scene: bool = False,
+) -> TimelineViewer | LiveViewer:
     """A viewer that serves from now on.
 
     Args:
@@ -40,6 +49,7 @@ def open_viewer(
         offset: s, the motion's time 0 in the video; None to find it.
         address, port: to listen at.
         token: who may look; ``new`` makes one.
+        scene: of a reconstruction, show the scene to be changed and not what came of it.
 
     Raises:
         InputError: viser is not installed, or a source cannot be shown.
@@ -56,9 +66,12 @@ def open_viewer(
         if len(sources) > 1:
             raise InputError("view", "source", "a live stream is shown by itself; name nothing beside it")
         return LiveViewer(sources[0], place)
-    if is_scene_folder(Path(sources[0])):
+    made = None if scene else reconstruction_folder(Path(sources[0]))
+    if made is not None or is_scene_folder(Path(sources[0])):
         if len(sources) > 1:
             raise InputError("view", "source", "a scene is shown by itself; name nothing beside it")
+        if made is not None:
+            return ReconstructionViewer(made, simulated_humanoid(), place, video)
         return SceneViewer(Path(sources[0]), place, video)
     footage = None if video is None else Footage(video, offset or 0.0)
     if footage is not None:
