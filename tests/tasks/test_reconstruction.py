@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from helpers.clip_folder import clip_folder, scene_of_a_step, scene_of_two_steps, standing_plan
+from helpers.clip_folder import clip_folder, scene_of_two_steps, standing_plan
 from helpers.mocap import default_humanoid
 
 from egopose.core.config import compose_config
@@ -25,7 +25,7 @@ from egopose.inference.clip_rollout import after, roll_out
 from egopose.inference.scene_values import window_value
 from egopose.pipeline.agent import Agent, load_agent
 from egopose.scene.clip import read_clip
-from egopose.scene.scene_file import read_scene
+from egopose.scene.scene_file import Box, Contact, read_scene
 from egopose.scene.simulated import load_simulated
 from egopose.tasks.reconstruction import TASK, ranges_of, touches_of
 from egopose.tasks.task import task_of
@@ -187,7 +187,23 @@ def test_a_window_trains_on_its_frames_and_frees_its_boxes(folder: Path, tmp_pat
     assert [tuple(piece) for piece in dataset_of(folder, "task.window=2").train] == [(0, 15, 24)]
     with pytest.raises(InputError, match=r"task\.window: 3 must be from 1 to 2"):
         dataset_of(folder, "task.window=3")
-    assert ranges_of(scene_of_a_step(), ["other"]).size == 0
+
+
+def test_only_the_boxes_of_a_window_vary_but_all_are_seen(tmp_path: Path) -> None:
+    """So every window's networks have the same shapes, and the next can begin with them."""
+    two = scene_of_two_steps()
+    third = Box("third", (0.4, 0.4), (2.0, 0.0), 1.0, 0.0, {"along": (-0.1, 0.1)})
+    contacts = (*two.contacts, Contact("right_hand", "third", 22, 23))
+    folder = clip_folder(tmp_path / "three", replace(two, boxes=(*two.boxes, third), contacts=contacts))
+    sizes = set()
+    for window, varies in (("1", [True, True, False]), ("3", [False, True, True]), ("null", [True] * 3)):
+        words = [f"task.window={window}"]
+        problem = TASK.problem(config_of(folder, *words), dataset_of(folder, *words), None)
+        assert problem.varies.tolist() == varies
+        change = problem.changes(50, torch.Generator().manual_seed(0))
+        assert (change.abs().amax((0, 2)) > 0).tolist() == varies
+        sizes.add(tuple(problem.observation_sizes.items()))
+    assert len(sizes) == 1
 
 
 def test_feet_without_contacts_in_the_scene_stand_on_the_floor(tmp_path: Path) -> None:

@@ -160,6 +160,26 @@ def test_a_fall_bootstraps_nothing_and_the_time_limit_does() -> None:
     assert target[:, 3].tolist() == pytest.approx([1 + gamma * 10] * 2, rel=1e-5)
 
 
+def test_a_time_limit_after_which_nothing_comes_bootstraps_nothing() -> None:
+    actor, critic = networks()
+    for parameter in critic.parameters():
+        parameter.data.zero_()
+    list(critic.parameters())[-1].data.fill_(10.0)
+    settings = {**SETTINGS, "normalize_advantage": False, "truncation_bootstraps": False}
+    ppo = PPO(actor, critic, PPOSettings.from_config(settings))
+    batch = make_env(num_envs=2).rollout(3, actor, break_when_any_done=False)
+    batch["next", "reward"].fill_(1.0)
+    for name in ("done", "terminated", "truncated"):
+        batch["next", name].zero_()
+    batch["next", "done"][:, 1] = True
+    batch["next", "terminated"][0, 1] = True
+    batch["next", "truncated"][1, 1] = True
+    target = ppo.advantages(batch)["value_target"].reshape(2, 3)
+    assert target[:, 1].tolist() == pytest.approx([1.0, 1.0])
+    assert target[:, 2].tolist() == pytest.approx([1 + 0.95 * 10] * 2), "the batch's end is no episode's"
+    assert batch["next", "terminated"][:, 1].flatten().tolist() == [True, False]
+
+
 def test_divergence_is_the_closed_form() -> None:
     actor, critic = networks()
     ppo = PPO(actor, critic, PPOSettings.from_config(SETTINGS))

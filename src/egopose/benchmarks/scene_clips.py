@@ -25,6 +25,8 @@ _LONGEST_GAP = 2  # frames
 _SWITCH = {"true": True, "yes": True, "false": False, "no": False}
 NOISES = ("measured", "hard", "none")
 BOXES = ("guessed", "none")
+#: Whether a simulated body acts a clip out: not at all, among the boxes of the first guess, or among fitted ones.
+PHYSICS = ("none", "given", "fitted")
 
 
 @dataclass(frozen=True)
@@ -37,6 +39,7 @@ class Chosen:
         noise: of :data:`NOISES`.
         boxes: of :data:`BOXES`: whether the scene that is given has boxes, moved from their true places.
         gap: leave 30 frames without anybody.
+        physics: of :data:`PHYSICS`: whether a simulated body acts the clips out, and its boxes may change.
         folder: of the results; empty for one that is thrown away.
         judge_only: make nothing, judge what is in the folder.
         source: the folder of the true clips; empty for those that come with the project.
@@ -47,6 +50,7 @@ class Chosen:
     noise: tuple[str, ...] = ("measured",)
     boxes: tuple[str, ...] = ("guessed",)
     gap: bool = False
+    physics: tuple[str, ...] = ("none",)
     folder: str = ""
     judge_only: bool = False
     source: str = ""
@@ -71,7 +75,7 @@ class Chosen:
             else:
                 given[key] = text if key in ("folder", "source") else tuple(text.split(","))
         chosen = Chosen(**given)  # type: ignore[arg-type]
-        for key, names in (("cameras", KINDS), ("noise", NOISES), ("boxes", BOXES)):
+        for key, names in (("cameras", KINDS), ("noise", NOISES), ("boxes", BOXES), ("physics", PHYSICS)):
             if unknown := [one for one in getattr(chosen, key) if one not in names]:
                 raise InputError(_SOURCE, key, f"{unknown[0]!r:.40}; there are {', '.join(names)}")
         if chosen.judge_only and not chosen.folder:

@@ -8,6 +8,7 @@ simulated motion too where the folder of results holds ``plan.npz``.
 from __future__ import annotations
 
 import json
+import shutil
 import tempfile
 import zlib
 from collections.abc import Iterator, Sequence
@@ -39,9 +40,10 @@ from egopose.evaluation.scene_metrics import SceneMotion, scene_figures
 from egopose.evaluation.scene_page import write_scene_page
 from egopose.humanoid.model import HumanoidModel
 from egopose.inference.scene_preparation import prepare_scene
+from egopose.inference.scene_recovery import PLAN, recover_scene
 from egopose.motion.motion import Motion
 from egopose.scene.camera_file import save_camera
-from egopose.scene.clip import read_clip
+from egopose.scene.clip import Clip, read_clip
 from egopose.scene.scene_file import Scene, write_scene
 from egopose.scene.simulated import SimulatedMotion, load_simulated
 
@@ -99,18 +101,21 @@ def run(overrides: Sequence[str], rounds: int) -> dict[str, Any]:
         clips = {name: read_true_clip(source / name, humanoid) for name in names}
         for (camera, noise, boxes, seed), name in views:
             view = View(name, camera, noise, boxes, chosen.gap, seed)
-            rows += _row(humanoid, clips[name], view, folder / view.name, chosen.judge_only)
+            rows += _row(humanoid, clips[name], view, folder / view.name, chosen)
             advance()
     return {"rounds": rounds, "rows": rows, "by_camera": by_camera([row for row in rows if "failed" not in row])}
 
 
-def _row(humanoid: HumanoidModel, clip: TrueClip, view: View, folder: Path, judge_only: bool) -> list[dict[str, Any]]:
+def _row(humanoid: HumanoidModel, clip: TrueClip, view: View, folder: Path, chosen: Chosen) -> list[dict[str, Any]]:
     """A row for each judged motion; one that says why where preparing failed."""
+    acted = [mode for mode in chosen.physics if mode != "none"]
     try:
-        if not judge_only:
+        if not chosen.judge_only:
             observe(humanoid, clip, view, folder)
             prepare(folder)
-        return [{**view.about(), **row} for row in judged(humanoid, clip, folder)]
+            for mode in acted:
+                act_out(folder, mode)
+        return [{**view.about(), **row} for row in judged(humanoid, clip, folder, acted)]
     except InputError as error:
         return [{**view.about(), "motion": "kinematic", "failed": str(error)}]
 
@@ -140,8 +145,19 @@ def prepare(folder: Path) -> None:
     prepare_scene(values, write_scene_page)
 
 
-def judged(humanoid: HumanoidModel, clip: TrueClip, folder: Path) -> list[dict[str, Any]]:
-    """Figures of the kinematic root in ``folder``, and of the simulated motion where ``plan.npz`` is there.
+def act_out(folder: Path, mode: str) -> None:
+    """``egopose reconstruct`` goes on from a prepared ``folder``, in ``folder/MODE``: ``given`` or ``fitted`` boxes."""
+    out = folder / mode
+    out.mkdir(exist_ok=True)
+    for file in folder.iterdir():
+        if file.is_file() and file.name not in (PLAN, "page.html"):
+            shutil.copy2(file, out / file.name)
+    values = compose_config("reconstruct", [f"fit={mode == 'fitted'}", f"out={out}"])
+    recover_scene(values, out, lambda _, page: page.write_text(""))
+
+
+def judged(humanoid: HumanoidModel, clip: TrueClip, folder: Path, acted: Sequence[str] = ()) -> list[dict[str, Any]]:
+    """Figures of the kinematic root in ``folder``, and of simulated motions: its ``plan.npz``, and those of ``acted``.
 
     Raises:
         InputError: a file is missing or damaged, or has other frames than the truth.
@@ -153,17 +169,22 @@ def judged(humanoid: HumanoidModel, clip: TrueClip, folder: Path) -> list[dict[s
         raise InputError(folder / "body.npz", "qpos", f"{len(found)} frames; the truth has {len(clip.simulated)}")
     true = clip.part(humanoid, start, len(found))
     kinematic = SceneMotion(found.body, found.touching, found.scene)
-    rows = [{"motion": "kinematic", **scene_figures(humanoid, kinematic, true, turn)}]
-    path = folder / "plan.npz"
-    if path.is_file():
-        plan = load_simulated(path)
-        scene = _with_tops(found.scene, plan)
-        feet = simulated_feet(path, plan, scene, humanoid)
-        if len(plan) != len(found):
-            raise InputError(path, "qpos", f"{len(plan)} frames; body.npz has {len(found)}")
-        motion = Motion(humanoid.skeleton, plan.qpos, found.body.fps)
-        rows.append({"motion": "simulated", **scene_figures(humanoid, SceneMotion(motion, feet, scene), true, turn)})
+    rows: list[dict[str, Any]] = [{"motion": "kinematic", **scene_figures(humanoid, kinematic, true, turn)}]
+    plans = {"simulated": folder / PLAN, **{f"simulated, {mode}": folder / mode / PLAN for mode in acted}}
+    for motion, path in plans.items():
+        if path.is_file():
+            simulated = _simulated(path, found, humanoid)
+            rows.append({"motion": motion, **scene_figures(humanoid, simulated, true, turn)})
     return rows
+
+
+def _simulated(path: Path, found: Clip, humanoid: HumanoidModel) -> SceneMotion:
+    plan = load_simulated(path)
+    scene = _with_tops(found.scene, plan)
+    feet = simulated_feet(path, plan, scene, humanoid)
+    if len(plan) != len(found):
+        raise InputError(path, "qpos", f"{len(plan)} frames; body.npz has {len(found)}")
+    return SceneMotion(Motion(humanoid.skeleton, plan.qpos, found.body.fps), feet, scene)
 
 
 def _with_tops(scene: Scene, plan: SimulatedMotion) -> Scene:

@@ -82,7 +82,7 @@ class ReconstructionProblem(ImitationProblem):
         hints: of the clip.
         touching: the end effectors.
         ranges: of the boxes.
-        varies: whether each episode's boxes are drawn from their ranges.
+        varies: ``[K]`` bool, which boxes are drawn anew for each episode; the others stand as in the first states.
         start: first states.
         sees_scene: whether the policy sees up, its height and where the boxes are, beside what the paper shows it.
     """
@@ -99,7 +99,7 @@ class ReconstructionProblem(ImitationProblem):
         hints: ClipHints,
         touching: TouchingPoints,
         ranges: SceneRanges,
-        varies: bool,
+        varies: Tensor,
         start: StartStates,
         sees_scene: bool,
     ) -> None:
@@ -188,10 +188,12 @@ class ReconstructionProblem(ImitationProblem):
         """As drawn for each episode, or as the first states have them. None where the scene has no boxes."""
         if not len(self.ranges.headings):
             return None
-        count = len(frame)
-        if self.varies:
-            return self.ranges.scene(self.ranges.drawn(count, generator))
-        return self.ranges.scene(self.start.change.expand(count, -1, -1))
+        return self.ranges.scene(self.changes(len(frame), generator))
+
+    def changes(self, count: int, generator: torch.Generator) -> Tensor:
+        """``[count, K, 4]`` of the boxes of so many episodes."""
+        standing = self.start.change.expand(count, -1, -1)
+        return torch.where(self.varies[:, None], self.ranges.drawn(count, generator), standing)
 
     def first_state(self, frame: Tensor, scene: Scene | None = None) -> tuple[Tensor, Tensor]:
         """The start's; a body that a box carries is moved as the box is, and one that would be in a box is raised."""

@@ -62,7 +62,7 @@ def roll_out(
     assert isinstance(base, EgoPoseEnv)
     problem, physics = base.problem, base.physics
     assert isinstance(problem, ReconstructionProblem)
-    problem.varies = False
+    problem.varies = torch.zeros_like(problem.varies)
     prepare_for_test(env, actor)
     observation = env.reset()
     if state is not None:

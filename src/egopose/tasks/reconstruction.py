@@ -6,7 +6,7 @@ the root is nobody tells the policy or its reward. The folder of the clip is the
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -121,7 +121,8 @@ class Reconstruction:
         termination = {**task["termination"], **({} if endings_end is None else {"enabled": endings_end})}
         touches = touches_of(clip, humanoid)
         touching = touching_points(humanoid)
-        ranges = ranges_of(clip.scene, window_of(config, clip).boxes)
+        ranges = ranges_of(clip.scene)
+        there = set(window_of(config, clip).boxes) if convert(task["scene"]["vary"], bool, "task.scene", "vary") else ()
         action = from_mapping(ActionSettings, task["action"], "task.action")
         if task["targets"] == "plan":
             action = replace(action, velocity_feedforward=0.0)
@@ -136,7 +137,7 @@ class Reconstruction:
             clip_hints(clip, humanoid, dataset.reference, touches, touching),
             touching,
             ranges,
-            convert(task["scene"]["vary"], bool, "task.scene", "vary"),
+            torch.tensor([box.name in there for box in clip.scene.boxes], dtype=torch.bool),
             _start(dataset, touches, ranges),
             convert(task["scene"]["seen"], bool, "task.scene", "seen"),
         )
@@ -196,11 +197,10 @@ def window_of(config: Mapping[str, Any], clip: Clip) -> Window:
     return there[int(number) - 1]
 
 
-def ranges_of(scene: Scene, boxes: Collection[str] | None = None) -> SceneRanges:
-    """What the scene leaves free of its boxes; of those that ``boxes`` does not name, nothing."""
+def ranges_of(scene: Scene) -> SceneRanges:
+    """What the scene leaves free of its boxes."""
     tops, headings = box_poses(scene)
-    free = [box.free if boxes is None or box.name in boxes else {} for box in scene.boxes]
-    span = np.array([[ranges.get(name, (0.0, 0.0)) for name in FREE] for ranges in free])
+    span = np.array([[box.free.get(name, (0.0, 0.0)) for name in FREE] for box in scene.boxes])
     low, high = torch.from_numpy(span.reshape(-1, len(FREE), 2)).unbind(-1)
     return SceneRanges(torch.from_numpy(tops), torch.from_numpy(headings), low.contiguous(), high.contiguous(), DEPTH)
 

@@ -113,13 +113,13 @@ class PlanSchool:
         for _ in range(settings.nearby):
             move = deviation * rng.normal(size=(len(frame), 2 * nv)) * rng.random((len(frame), 1))
             parts.append((frame, moved(qpos, move[:, :nv]), qvel + move[:, nv:]))
-        varies, generator = self._problem.varies, torch.Generator().manual_seed(int(rng.integers(2**31)))
+        generator = torch.Generator().manual_seed(int(rng.integers(2**31)))
         out = None
         for at, places, speeds in parts:
             ctrl = torch.from_numpy(self._teacher.control(at, places, speeds))
             base = self._problem.target(torch.zeros(ctrl.shape), torch.from_numpy(at + 1))
             action = (ctrl - base) / self._problem.action.scale
-            change = self._problem.ranges.drawn(len(at), generator) if varies and parts[0][1] is not places else None
+            change = None if places is qpos else self._problem.changes(len(at), generator)
             state, scene = self.seen(at, places, speeds, change)
             part = PlanLessons(state, scene, action.clamp(-settings.largest, settings.largest).float())
             out = part if out is None else out + part

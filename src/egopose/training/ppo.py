@@ -63,6 +63,8 @@ class PPOSettings:
         momentum: of ``nesterov``.
         adaptive_sampling: tuples of each episode that are learned from, see
             :func:`egopose.training.adaptive_sampling.sampled_tuples`; None for all.
+        truncation_bootstraps: whether a time limit bootstraps from the critic; False where nothing comes after it, as
+            after a clip's end.
     """
 
     gamma: float
@@ -84,6 +86,7 @@ class PPOSettings:
     optimizer: str = "adam"
     momentum: float = 0.9
     adaptive_sampling: int | None = None
+    truncation_bootstraps: bool = True
 
     @classmethod
     def from_config(cls, values: Any, source: str = "conf/algo") -> PPOSettings:
@@ -190,6 +193,9 @@ class PPO:
             batch: ``[N, T]`` as collected.
         """
         self._values(batch)
+        if not self.settings.truncation_bootstraps:
+            batch = batch.copy()  # not of the tensors: what is collected goes on saying which episodes fell
+            batch["next", "terminated"] = batch["next", "done"]
         self.gae(batch)
         if self.in_bfloat16:
             self._act_again(batch)

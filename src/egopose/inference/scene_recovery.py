@@ -1,0 +1,134 @@
+"""The stages behind a prepared scene: a motion that physics allows, the scene it fits, and what came of it.
+
+They follow :mod:`egopose.inference.scene_preparation` in the same folder, with cards of their own: what is there and
+still fits is not made again.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from egopose.checkpoint.pretrained import FOLDER
+from egopose.core.config import convert
+from egopose.core.stages import StageFolder
+from egopose.data.preparation import humanoid_of
+from egopose.inference.motion_cost import TERMS
+from egopose.inference.progress import StageProgress
+from egopose.inference.sampled_motion import Found, SamplingSettings
+from egopose.inference.scene_motion import recovered
+from egopose.pipeline.agent import load_policy
+from egopose.scene.clip import read_clip
+from egopose.scene.scene_file import FREE, Box, Scene, write_scene
+
+PLAN, FITTED, SEARCH, PAGE = "plan.npz", "scene.fitted.yaml", "search.json", "reconstruction.html"
+#: What a frame costs in each stage, ms: measured on two cores beside other work.
+_COSTS = {"physics": 400.0, "report": 60.0}
+#: Changes with what the stages compute from the same inputs.
+_VERSION = 1
+
+
+def recover_scene(values: Mapping[str, Any], folder: Path, write_report: Callable[[Path, Path], object]) -> Path:
+    """Find the simulated motion of a prepared ``folder`` and report it; returns the folder.
+
+    Leaves ``plan.npz`` (:class:`~egopose.scene.simulated.SimulatedMotion`), ``scene.fitted.yaml``, ``search.json`` and
+    ``reconstruction.html``.
+
+    Args:
+        values: ``conf/reconstruct.yaml``, resolved.
+        folder: of :func:`~egopose.inference.scene_preparation.prepare_scene`.
+        write_report: writes the page of a folder of results to a file.
+
+    Raises:
+        InputError: a setting, the policy or a file of the preparation cannot be used. Stages that were made stay.
+    """
+    settings = SamplingSettings.from_config(values["sampling"])
+    chosen = FOLDER / "tracker" if values["policy"] is None else Path(str(values["policy"]))
+    policy = load_policy(chosen)
+    free = convert(values["fit"], bool, "conf/reconstruct.yaml", "fit")
+    clip, humanoid, store = read_clip(folder), humanoid_of(values), StageFolder(folder)
+    made_from = {name: store.digest(name) for name in ("body.npz", "root.npz", "joints.npz", "orientation.npz")}
+    inputs = {
+        **made_from,
+        "scene": repr((clip.scene.boxes, clip.scene.contacts)),
+        "sampling": values["sampling"],
+        "fit": free,
+        "policy": _digest(policy.path),
+        "version": _VERSION,
+    }
+    with StageProgress(_COSTS, len(clip)) as progress:
+        if not store.done("physics", inputs):
+            with progress.stage("physics") as advance:
+                share = _Share(settings.passes + 1, advance)
+                found = recovered(folder, clip, humanoid, policy, settings, free, share)
+                store.make("physics", inputs, lambda part: _keep(found, clip.scene, part))
+        told = {PLAN: store.digest(PLAN), FITTED: store.digest(FITTED), "version": _VERSION}
+        if not store.done("report", told):
+            with progress.stage("report"):
+                store.make("report", told, lambda part: _report(write_report, folder, part))
+    return folder
+
+
+def _report(write: Callable[[Path, Path], object], folder: Path, out: Path) -> None:
+    write(folder, out / PAGE)
+
+
+class _Share:
+    """Frames of several passes as frames of one stage."""
+
+    def __init__(self, passes: int, advance: Callable[[int], None]) -> None:
+        self._passes, self._advance, self._done = passes, advance, 0
+
+    def __call__(self, frames: int) -> None:
+        before, self._done = self._done // self._passes, self._done + frames
+        self._advance(self._done // self._passes - before)
+
+
+def _digest(checkpoint: Path) -> str:
+    """Of a checkpoint: its list of checksums stands for all of its files."""
+    return (checkpoint / "checksums.json").read_text(encoding="utf8")
+
+
+def _keep(found: Found, scene: Scene, out: Path) -> None:
+    found.motion.save(out / PLAN)
+    write_scene(fitted(scene, found), out / FITTED)
+    spread = found.changes.std(axis=0)
+    told = {
+        "cost": dict(zip(TERMS, found.cost.mean(axis=0).tolist(), strict=True)),
+        "total": float(found.totals[0]),
+        "boxes": {
+            box.name: {
+                name: {"change": float(found.change[k, c]), "spread": float(spread[k, c])}
+                for c, name in enumerate(FREE)
+                if name in box.free
+            }
+            for k, box in enumerate(scene.boxes)
+        },
+    }
+    (out / SEARCH).write_text(json.dumps(told, indent=1))
+
+
+def fitted(scene: Scene, found: Found) -> Scene:
+    """The scene with its boxes where the best body had them; what may still change shrinks to what is left of it."""
+    motion = found.motion
+    boxes = [
+        _moved(box, motion.box_tops[k], float(motion.box_headings[k]), found.change[k])
+        for k, box in enumerate(scene.boxes)
+    ]
+    return replace(scene, boxes=tuple(boxes))
+
+
+def _moved(box: Box, top: np.ndarray, heading: float, change: np.ndarray) -> Box:
+    left = {
+        name: (min(low - by, 0.0), max(high - by, 0.0))
+        for name, by in zip(FREE, change.tolist(), strict=True)
+        for low, high in [box.free.get(name, (0.0, 0.0))]
+        if name in box.free
+    }
+    place = (round(float(top[0]), 4), round(float(top[1]), 4))
+    return replace(box, place=place, height=round(float(top[2]), 4), yaw=round(heading, 4), free=left)
