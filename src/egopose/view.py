@@ -38,6 +38,7 @@ def command_line() -> argparse.ArgumentParser:
         "--offset", type=_offset, default=0.0, metavar="S", help="the motion's time 0 in the video; `auto` finds it"
     )
     parser.add_argument("--scene", action="store_true", help="of a reconstruction: its scene, to be changed and saved")
+    parser.add_argument("--simulated", type=Path, metavar="NPZ", help="of a prepared clip: what `evaluate` made of it")
     parser.add_argument("--address", default="127.0.0.1", help="to listen at; any but this machine's own needs a token")
     parser.add_argument("--port", type=int, default=8080, help="0 for a free one")
     parser.add_argument("--token", help="16 letters and digits at least; `new` makes one and prints it")
@@ -51,7 +52,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     given = command_line().parse_args(arguments)
     try:
         where = (given.address, given.port, given.token)
-        viewer = open_viewer(given.sources, given.video, given.offset, *where, scene=given.scene)
+        viewer = open_viewer(given.sources, given.video, given.offset, *where, given.scene, given.simulated)
     except InputError as error:
         print(f"error: {error}", file=sys.stderr)
         raise SystemExit(2) from None

@@ -169,6 +169,18 @@ def test_without_film_or_opengl_the_page_says_so(tmp_path: Path, monkeypatch: py
     assert "No renderings: no OpenGL on this machine" in out.read_text(encoding="utf-8")
 
 
+def test_a_motion_elsewhere_among_a_clip_without_a_film(tmp_path: Path) -> None:
+    folder = write_folder(tmp_path / "leap", jumping(), scene_at(0.3))
+    (folder / "plan.npz").rename(tmp_path / "simulated.npz")
+    (folder / "projection.npz").unlink()
+    words = [f"simulated={tmp_path / 'simulated.npz'}", "reconstruction.moments=2", "reconstruction.size=32"]
+    page = run_report(folder, words).read_text(encoding="utf-8")
+    assert page.count("<figure>") <= 1
+    assert "film, simulated" not in page
+    with pytest.raises(InputError):
+        run_report(folder, [f"simulated={tmp_path / 'nowhere.npz'}"])
+
+
 def test_many_failures_are_counted(tmp_path: Path) -> None:
     contacts = tuple(Contact("left_hand", "far", first, first + 3) for first in range(0, 50, 10))
     folder = write_folder(tmp_path / "leap", jumping(), replace(scene_at(0.3), contacts=contacts))

@@ -136,6 +136,17 @@ def test_every_step_of_physics_has_its_own_forces(folder: Path, found: Reconstru
     assert caught.value.field == "rate"
 
 
+def test_a_simulated_motion_that_lies_elsewhere(tmp_path: Path) -> None:
+    folder = write_folder(tmp_path / "leap", jumping(), scene_at(0.3))
+    (folder / "plan.npz").rename(tmp_path / "simulated.npz")
+    config = {**compose_config("export"), "simulated": str(tmp_path / "simulated.npz")}
+    run_export(folder, [str(tmp_path / "out.npz")], config)
+    np.testing.assert_array_equal(read_motion(tmp_path / "out.npz").qpos, jumping().qpos)
+    with pytest.raises(InputError, match="folder of a prepared clip") as caught:
+        run_export(folder / "body.npz", [str(tmp_path / "out.npz")], config)
+    assert caught.value.field == "simulated"
+
+
 def test_numbers_of_another_source_are_refused(folder: Path, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="needs a reconstruction"):
         run_export(folder / "body.npz", [str(tmp_path / "x.numbers.csv")], compose_config("export"))

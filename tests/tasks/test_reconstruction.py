@@ -90,8 +90,11 @@ def test_the_command_trains_and_a_run_cut_off_goes_on_to_the_bit(run: Path, tmp_
 
 
 def test_evaluate_leaves_a_motion_that_physics_plays_again_to_the_bit(run: Path, tmp_path: Path) -> None:
-    values = compose_config("evaluate", [f"checkpoint={run}", f"out={tmp_path / 'out'}", "threads=1"])
+    values = compose_config("evaluate", [f"checkpoint={run}", f"out={tmp_path / 'out'}", "threads=1", "report=true"])
     told = evaluate(values)
+    page = tmp_path / "out" / "reconstruction.html"
+    assert f"report: {page}" in told
+    assert "Where it fails" in page.read_text()
     assert "frames until an ending" in told
     assert "scene by the values" in told
     motion = load_simulated(tmp_path / "out" / "simulated.npz")

@@ -53,7 +53,8 @@ def write_reconstruction_page(found: Reconstruction, settings: ReconstructionPag
     """Write the page.
 
     Args:
-        found: with ``projection.npz`` in its folder, and ``poses.npz`` where the film is gone.
+        found: without ``projection.npz`` in its folder no film is shown; where the film is gone ``poses.npz`` tells its
+            size.
         settings: how much is shown.
         out: the HTML file; its folder must exist.
 
@@ -66,6 +67,7 @@ def write_reconstruction_page(found: Reconstruction, settings: ReconstructionPag
     values = {
         "title": f"{found.folder.resolve().name}: the reconstruction",
         "data": {"numbers": [_plain(row) for row in found.numbers.rows()], "failures": failures},
+        "motion": found.path,
         "begin": found.scene.begin,
         "fps": found.motion.fps,
         "failures": failures[: settings.sentences],
@@ -87,17 +89,25 @@ def write_reconstruction_page(found: Reconstruction, settings: ReconstructionPag
 
 def _grids(found: Reconstruction, settings: ReconstructionPageSettings) -> tuple[list[Film], str]:
     """Pictures, and why there are no renderings among them."""
-    projection, moments = load_projection(found.folder / "projection.npz"), _moments(found, settings.moments)
+    path = found.folder / "projection.npz"
+    projection = load_projection(path) if path.is_file() else None
+    moments = _moments(found, settings.moments, projection is not None)
     try:
         made = pictures.moment_grids(found, projection, moments, settings.size)
-        said = f"From above: {', '.join(pictures.row_names())}. In the film: kinematic grey, simulated green."
+        said = f"From above: {', '.join(pictures.row_names(projection is not None))}."
+        said += "" if projection is None else " In the film: kinematic grey, simulated green."
+        return [_photo(grid, said) for grid in made], ""
     except RuntimeError as error:
+        if projection is None:
+            return [], str(error)
         strip = pictures.film_strip(found, projection, moments, settings.size)
         return [_photo(strip, "The film: kinematic body grey, simulated body green.")], str(error)
-    return [_photo(grid, said) for grid in made], ""
 
 
-def _moments(found: Reconstruction, count: int) -> Moments:
+def _moments(found: Reconstruction, count: int, film: bool) -> Moments:
+    if not film:
+        numbers = np.linspace(0, len(found.motion) - 1, count).round().astype(int)
+        return Moments(tuple(dict.fromkeys(numbers.tolist())), ())
     sources = Sources(film_of(found.folder), found.folder / "poses.npz", found.motion.fps)
     return read_moments(sources, found.folder, count)
 

@@ -25,39 +25,40 @@ _ACROSS = 4  # moments beside each other
 _DISTANCE, _ASIDE = 3.4, 1.3  # m from the camera to the body, and more for each m that the two bodies are apart
 _APART = 1.5  # m: bodies further apart are looked at each by itself
 _GREY = 120
+_USUAL_VIEW = (90.0, -10.0)  # degrees: along y, as a scene's camera looks, and a little down
 
 
-def moment_grids(found: Reconstruction, projection: Projection, moments: Moments, size: int) -> list[Frame]:
+def moment_grids(found: Reconstruction, projection: Projection | None, moments: Moments, size: int) -> list[Frame]:
     """Pictures of a few moments each: a column a moment, rows as :func:`row_names` says.
 
     Args:
         found: what is shown.
-        projection: to the film's pixels.
+        projection: to the film's pixels; None where nothing is known of a film.
         moments: frames of the film.
         size: px of a panel.
 
     Raises:
         RuntimeError: no OpenGL here.
     """
-    film = film_panels(found, projection, moments, size)
+    rows = [] if projection is None else [film_panels(found, projection, moments, size)]
     with _Renderer(found, found.scene, size) as simulated, _Renderer(found, found.clip.scene, size) as kinematic:
-        rows = [film]
         for renderer, motion, turn in (
             (simulated, found.motion, 0.0),
             (kinematic, found.clip.body, 0.0),
             (simulated, found.motion, 90.0),
         ):
-            rows.append([renderer.draw(motion.qpos[t], projection.at(t), t, turn) for t in moments.numbers])
+            looks = {t: _USUAL_VIEW if projection is None else view_of(projection.at(t)) for t in moments.numbers}
+            rows.append([renderer.draw(motion.qpos[t], look, t, turn) for t, look in looks.items()])
     named = [
         [label_frame(panel, f"{t} {name}") for t, panel in zip(moments.numbers, row, strict=True)]
-        for name, row in zip(row_names(), rows, strict=True)
+        for name, row in zip(row_names(projection is not None), rows, strict=True)
     ]
     return [_grid([row[k : k + _ACROSS] for row in named]) for k in range(0, len(moments.numbers), _ACROSS)]
 
 
-def row_names() -> tuple[str, ...]:
-    """What the rows of :func:`moment_grids` show, from above."""
-    return ("film", "simulated", "kinematic", "simulated, side")
+def row_names(film: bool) -> tuple[str, ...]:
+    """What the rows of :func:`moment_grids` show, from above, with a film or without."""
+    return (*(("film",) if film else ()), "simulated", "kinematic", "simulated, side")
 
 
 def film_strip(found: Reconstruction, projection: Projection, moments: Moments, size: int) -> Frame:
@@ -113,12 +114,12 @@ class _Renderer:
     def __exit__(self, *_: object) -> None:
         self._inner.close()
 
-    def draw(self, pose: Array, projection: Projection, t: int, turn: float) -> Frame:
+    def draw(self, pose: Array, view: tuple[float, float], t: int, turn: float) -> Frame:
         """Bodies near each other are looked at from one place: how far they are apart is seen."""
         first, second = (root[t] for root in self._roots)
         apart = float(np.linalg.norm(first - second))
         near = apart < _APART
-        azimuth, elevation = view_of(projection)
+        azimuth, elevation = view
         self._view.lookat = (0.5 * (first + second) if near else pose[:3]) - [0, 0, 0.15]
         self._view.distance = _DISTANCE + (_ASIDE * apart if near else 0.0)
         self._view.azimuth, self._view.elevation = azimuth + turn, min(elevation, -5.0)

@@ -16,8 +16,11 @@ import torch
 
 from egopose.core.atomic_write import write_text_whole
 from egopose.core.errors import InputError
+from egopose.data.preparation import humanoid_of
 from egopose.envs.starts import Piece
 from egopose.evaluation import position_metrics
+from egopose.evaluation.reconstruction_page import PAGE
+from egopose.evaluation.reports import rollout_report
 from egopose.inference.clip_rollout import ClipRollout, after, joined, roll_out
 from egopose.inference.scene_values import window_value
 from egopose.motion.motion import Motion
@@ -69,8 +72,6 @@ def run_reconstruction(
     Returns:
         What the terminal shows.
     """
-    if values["report"]:
-        raise InputError("conf/evaluate.yaml", "report", "there is no such page of a reconstruction")
     lines = []
     threads = int(values["threads"])
     for number, agent in enumerate(agents):
@@ -81,6 +82,16 @@ def run_reconstruction(
         lines.append("one after the other:\n" + _kept(one_after_the_other(agents, threads), agents[0], out))
     fit = fitted_scene(agents, out)
     return "\n".join([*lines, *([] if fit is None else [fit])])
+
+
+def write_rollout_page(out: Path, agents: Sequence[Agent]) -> Path:
+    """The page of the motion that :func:`run_reconstruction` left in ``out``, beside it.
+
+    Raises:
+        InputError: the motion is of a part of the clip alone, or a file of the clip's folder is missing.
+    """
+    config = agents[0].config
+    return rollout_report(Path(str(config["task"]["clip"])), humanoid_of(config), out / MOTION, out / PAGE)
 
 
 def one_after_the_other(agents: Sequence[Agent], threads: int) -> ClipRollout:

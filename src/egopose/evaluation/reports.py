@@ -41,9 +41,24 @@ def reconstruction_report(folder: Path, overrides: Sequence[str] = ()) -> Path:
         InputError: a file is missing or damaged, or the controls do not lead through the states.
     """
     config = compose_config("report", overrides)
-    settings = from_mapping(ReconstructionPageSettings, config["reconstruction"], f"{_SOURCE}: reconstruction")
-    found = read_reconstruction(folder, simulated_humanoid(str(config["humanoid"])))
-    return write_reconstruction_page(found, settings, _out(config, folder, PAGE))
+    humanoid, out = simulated_humanoid(str(config["humanoid"])), _out(config, folder, PAGE)
+    return rollout_report(folder, humanoid, _simulated(config), out, overrides)
+
+
+def rollout_report(
+    clip: Path, humanoid: HumanoidModel, simulated: Path | None, out: Path, overrides: Sequence[str] = ()
+) -> Path:
+    """Write the page of any simulated motion of a prepared clip to ``out``; None for the clip's own ``plan.npz``.
+
+    Raises as :func:`reconstruction_report`.
+    """
+    values = compose_config("report", overrides)["reconstruction"]
+    settings = from_mapping(ReconstructionPageSettings, values, f"{_SOURCE}: reconstruction")
+    return write_reconstruction_page(read_reconstruction(clip, humanoid, simulated), settings, out)
+
+
+def _simulated(config: Mapping[str, Any]) -> Path | None:
+    return None if config["simulated"] is None else Path(str(config["simulated"])).expanduser()
 
 
 def run_report(folder: Path, overrides: Sequence[str] = ()) -> Path:
@@ -59,7 +74,7 @@ def run_report(folder: Path, overrides: Sequence[str] = ()) -> Path:
             else "no such folder"
         )
         raise InputError(folder, "path", cause)
-    if reconstruction_folder(folder) is not None:
+    if reconstruction_folder(folder, _simulated(compose_config("report", overrides))) is not None:
         return reconstruction_report(folder, overrides)
     if (folder / "results.json").is_file():
         try:

@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 from egopose.evaluation.estimation_run import run_evaluation, summary
 from egopose.evaluation.forecast_run import run_forecast_evaluation
 from egopose.evaluation.options import data_at, output_folder, physics_group
-from egopose.evaluation.reconstruction_run import run_reconstruction
+from egopose.evaluation.reconstruction_run import run_reconstruction, write_rollout_page
 from egopose.evaluation.reports import evaluation_report
 from egopose.evaluation.reset_threshold import choose_threshold
 from egopose.evaluation.take_videos import take_videos
-from egopose.pipeline.agent import load_agent
+from egopose.pipeline.agent import Agent, load_agent
 from egopose.tasks.task import task_of
 from egopose.vision.corruption import Corruption
 
@@ -21,8 +22,14 @@ def _estimates(*arguments: Any) -> str:
     return summary(run_evaluation(*arguments))
 
 
+def _evaluation_page(out: Path, agents: Sequence[Agent]) -> Path:
+    return evaluation_report(out, agents[0].dataset.humanoid)
+
+
 #: How policies of a task are scored, by what the task says; see :class:`egopose.tasks.task.Task`.
 PROTOCOLS = {"estimates": _estimates, "forecasts": run_forecast_evaluation, "reconstruction": run_reconstruction}
+#: And the page of what was found.
+PAGES = {"estimates": _evaluation_page, "forecasts": _evaluation_page, "reconstruction": write_rollout_page}
 
 
 def evaluate(values: Mapping[str, Any]) -> str:
@@ -51,7 +58,8 @@ def evaluate(values: Mapping[str, Any]) -> str:
     spoilt = Corruption.from_config(values) is not None
     part = f"{values['split']}-corrupted" if spoilt else str(values["split"])
     out = output_folder(values["out"], agents[0].path, part)
-    text = PROTOCOLS[task_of(agents[0].config).protocol](values, agents, names, videos, out)
+    protocol = task_of(agents[0].config).protocol
+    text = PROTOCOLS[protocol](values, agents, names, videos, out)
     if values["report"]:
-        text += f"\nreport: {evaluation_report(out, agents[0].dataset.humanoid)}"
+        text += f"\nreport: {PAGES[protocol](out, agents)}"
     return text

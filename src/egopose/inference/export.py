@@ -22,7 +22,6 @@ from egopose.humanoid.inverse_dynamics import ForceSettings, with_forces
 from egopose.humanoid.model import HumanoidModel
 from egopose.humanoid.replayed_forces import every_step
 from egopose.inference.reconstruction import (
-    PLAN,
     Reconstruction,
     read_reconstruction,
     reconstruction_folder,
@@ -60,10 +59,7 @@ def run_export(source: Path, files: Sequence[str], config: Mapping[str, Any]) ->
     if not files:
         raise InputError("export", "to", f"says no file; endings are {', '.join([*WRITERS, NUMBERS])}")
     _check_part(str(config["part"]))
-    folder = reconstruction_folder(source)
-    found = (
-        None if folder is None else read_reconstruction(folder, simulated_humanoid(str(config["forces"]["humanoid"])))
-    )
+    found = _reconstruction(source, config)
     numbers = [file for file in files if file.lower().endswith(NUMBERS)]
     if numbers and found is None:
         raise InputError(source, "to", f"{NUMBERS} needs a reconstruction: a folder with plan.npz")
@@ -94,6 +90,17 @@ def run_export(source: Path, files: Sequence[str], config: Mapping[str, Any]) ->
     return written
 
 
+def _reconstruction(source: Path, config: Mapping[str, Any]) -> Reconstruction | None:
+    """None where the source is none."""
+    simulated = None if config["simulated"] is None else Path(str(config["simulated"])).expanduser()
+    folder = reconstruction_folder(source, simulated)
+    if folder is None:
+        if simulated is not None:
+            raise InputError(source, "simulated", "needs the folder of a prepared clip beside it")
+        return None
+    return read_reconstruction(folder, simulated_humanoid(str(config["forces"]["humanoid"])), simulated)
+
+
 def _motions(
     source: Path, found: Reconstruction | None, files: Sequence[str], config: Mapping[str, Any]
 ) -> Iterator[tuple[str, Path, Motion]]:
@@ -103,7 +110,7 @@ def _motions(
             raise InputError(_SOURCE, "rate", f"must be control or physics, not {config['rate']!r}")
         stepwise = config["rate"] == "physics"
         motion = every_step(found.humanoid, found.forces, found.motion.name) if stepwise else found.motion
-        yield found.folder.resolve().name, found.folder / PLAN, motion
+        yield found.folder.resolve().name, found.path, motion
         return
     if found is not None:
         files_of = {found.folder.resolve().name: found.folder / "body.npz"}

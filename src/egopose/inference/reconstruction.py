@@ -26,6 +26,7 @@ class Reconstruction:
 
     Args:
         folder: of `egopose reconstruct`.
+        path: of the simulated motion.
         clip: the prepared clip: the kinematic body, contacts and the scene's first guess.
         scene: the clip's scene with the boxes where the simulated body found them.
         humanoid: in a world with these boxes.
@@ -35,6 +36,7 @@ class Reconstruction:
     """
 
     folder: Path
+    path: Path
     clip: Clip
     scene: Scene
     humanoid: HumanoidModel
@@ -48,10 +50,14 @@ class Reconstruction:
         return box_poses(self.scene)[0]
 
 
-def reconstruction_folder(source: Path) -> Path | None:
-    """The folder of a reconstruction, of it or of its ``plan.npz``; None for anything else."""
+def reconstruction_folder(source: Path, path: Path | None = None) -> Path | None:
+    """The folder of a reconstruction, of it or of its ``plan.npz``; None for anything else.
+
+    ``path`` is a simulated motion that lies elsewhere: the folder then needs no ``plan.npz``.
+    """
     folder = source.parent if source.name == PLAN else source
-    return folder if all((folder / name).is_file() for name in (PLAN, "body.npz", "scene.yaml")) else None
+    needed = ("body.npz", "scene.yaml") if path is not None else (PLAN, "body.npz", "scene.yaml")
+    return folder if all((folder / name).is_file() for name in needed) else None
 
 
 def simulated_humanoid(choice: str = "default") -> HumanoidModel:
@@ -59,23 +65,25 @@ def simulated_humanoid(choice: str = "default") -> HumanoidModel:
     return humanoid_of(compose_config("reconstruct", [f"humanoid={choice}"]))
 
 
-def read_reconstruction(folder: Path, humanoid: HumanoidModel) -> Reconstruction:
+def read_reconstruction(folder: Path, humanoid: HumanoidModel, path: Path | None = None) -> Reconstruction:
     """Read a folder and play its controls again.
 
     Args:
-        folder: with ``plan.npz`` and what `egopose reconstruct prepare` leaves.
+        folder: with what `egopose reconstruct prepare` leaves, and ``plan.npz``.
         humanoid: bare, at the rate of the simulation.
+        path: another simulated motion of the clip, as `egopose evaluate` leaves one; None for ``plan.npz``.
 
     Raises:
         InputError: a file is missing or damaged, the simulated motion is not of this clip, or its controls do not lead
             through the states.
     """
-    clip, simulated = read_clip(folder), load_simulated(folder / PLAN)
+    path = folder / PLAN if path is None else path
+    clip, simulated = read_clip(folder), load_simulated(path)
     if len(simulated.box_tops) != len(clip.scene.boxes):
         cause = f"there are {len(simulated.box_tops)}; scene.yaml has {len(clip.scene.boxes)}"
-        raise InputError(folder / PLAN, "box_tops", cause)
+        raise InputError(path, "box_tops", cause)
     if len(simulated) != len(clip):
-        raise InputError(folder / PLAN, "qpos", f"{len(simulated)} frames; the clip has {len(clip)}")
+        raise InputError(path, "qpos", f"{len(simulated)} frames; the clip has {len(clip)}")
     among = humanoid_in(clip.scene, humanoid)
     try:
         forces = replay_forces(
@@ -83,12 +91,13 @@ def read_reconstruction(folder: Path, humanoid: HumanoidModel) -> Reconstruction
         )
     except ValueError as error:
         cause = f"{error}. Was the scene changed after it was made? Then reconstruct again"
-        raise InputError(folder / PLAN, "ctrl", cause) from None
+        raise InputError(path, "ctrl", cause) from None
     name = clip.body.name or folder.resolve().name
     bare = Motion(humanoid.skeleton, simulated.qpos, 1.0 / humanoid.control_dt, name=name)
     numbers = movement_numbers(among, forces, simulated.box_tops)
     return Reconstruction(
         folder,
+        path,
         clip,
         _as_simulated(clip.scene, simulated),
         among,

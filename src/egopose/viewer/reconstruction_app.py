@@ -45,14 +45,22 @@ class ReconstructionViewer(TimelineViewer):
         humanoid: that was simulated, without boxes.
         address: where browsers come in.
         video: the film, where it is no longer where it was.
+        simulated: another simulated motion of the clip; None for ``plan.npz``.
 
     Raises:
         InputError: a file is missing or damaged, the controls do not lead through the states, or the address cannot be
             listened at.
     """
 
-    def __init__(self, folder: Path, humanoid: HumanoidModel, address: Address, video: Path | None = None) -> None:
-        self._found = found = read_reconstruction(folder, humanoid)
+    def __init__(
+        self,
+        folder: Path,
+        humanoid: HumanoidModel,
+        address: Address,
+        video: Path | None = None,
+        simulated: Path | None = None,
+    ) -> None:
+        self._found = found = read_reconstruction(folder, humanoid, simulated)
         self._projection = load_projection(folder / "projection.npz")
         if len(self._projection.origin) != len(found.motion):
             cause = f"{len(self._projection.origin)} frames; the clip has {len(found.motion)}"

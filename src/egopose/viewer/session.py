@@ -40,6 +40,7 @@ def open_viewer(
     port: int,
     token: str | None,
     scene: bool = False,
+    simulated: Path | None = None,
 ) -> TimelineViewer | LiveViewer:
     """A viewer that serves from now on.
 
@@ -50,6 +51,7 @@ def open_viewer(
         address, port: to listen at.
         token: who may look; ``new`` makes one.
         scene: of a reconstruction, show the scene to be changed and not what came of it.
+        simulated: of a reconstruction, another simulated motion of the clip than ``plan.npz``.
 
     Raises:
         InputError: viser is not installed, or a source cannot be shown.
@@ -66,12 +68,12 @@ def open_viewer(
         if len(sources) > 1:
             raise InputError("view", "source", "a live stream is shown by itself; name nothing beside it")
         return LiveViewer(sources[0], place)
-    made = None if scene else reconstruction_folder(Path(sources[0]))
+    made = None if scene else reconstruction_folder(Path(sources[0]), simulated)
     if made is not None or is_scene_folder(Path(sources[0])):
         if len(sources) > 1:
             raise InputError("view", "source", "a scene is shown by itself; name nothing beside it")
         if made is not None:
-            return ReconstructionViewer(made, simulated_humanoid(), place, video)
+            return ReconstructionViewer(made, simulated_humanoid(), place, video, simulated)
         return SceneViewer(Path(sources[0]), place, video)
     footage = None if video is None else Footage(video, offset or 0.0)
     if footage is not None:
