@@ -43,7 +43,7 @@ def main(run: str, out: Path) -> None:
             up &= ~after["terminated"].squeeze(-1)
             frames += up
             seen = after.exclude("reward", "action")
-    window = window_value(agent, ranges, 0, piece.stop - 1)
+    window = window_value(agent, ranges, 0, None)
     fitted = torch.stack([window(e) for e in grid])
     told = {"earned": earned, "frames": frames, "value": value, "fitted": fitted}
     figures = {name: np.round(table.reshape(SIDE, SIDE).numpy(), 2).tolist() for name, table in told.items()}

@@ -141,7 +141,6 @@ def test_a_guess_is_off_by_what_it_may_be(seed: int, turn: float) -> None:
     assert abs(box.height - 0.3) <= 0.2 + 1e-3
     assert box.yaw + turn == pytest.approx(0.4, abs=1e-3)
     assert guess.camera.motion == "pan"
-    assert guessed_scene(true, "pan", turn, start, None).boxes == ()
 
 
 def test_every_clip_that_comes_along_comes_back_to_the_bit() -> None:

@@ -19,7 +19,16 @@ from egopose.scene.poses.timing import cut, known_span, resampled
 from egopose.scene.projection import fit_projection
 from egopose.scene.root import Support
 from egopose.scene.scene_file import FLOOR, Box, Contact, Scene
-from egopose.scene.supports import contacts_of, filled_scene, floor_height, levels, told_contacts, touched
+from egopose.scene.supports import (
+    contacts_of,
+    filled_scene,
+    floor_height,
+    level_heights,
+    levels,
+    matched,
+    told_contacts,
+    touched,
+)
 
 
 def directions(points: np.ndarray, pairs: list[tuple[int, int]]) -> np.ndarray:
@@ -104,6 +113,31 @@ def test_a_box_that_the_user_described_takes_the_level() -> None:
     assert (bench.name, bench.size, bench.height) == ("bench", (0.4, 1.2), 0.5)
     assert bench.place is not None
     assert filled.contacts[1].touches == "bench"
+
+
+def test_feet_stand_on_the_boxes_that_a_scene_tells_or_on_its_floor() -> None:
+    """The step was guessed 0.15 m too high; the last support seems to float, and there is nothing but floor."""
+    rows = [Support(s.foot, s.start, s.stop, s.height - 1.0) for s in supports()]
+    rows[-1] = Support(1, 24, 30, 0.2)
+    step = Box("step", (0.5, 0.8), place=(1.0, 0.0), height=0.55, yaw=0.0)
+    on = matched(Scene(boxes=(step,)), rows, [None] * 4, 0.0, feet())
+    assert on == [FLOOR, "step", "step", FLOOR]
+    assert matched(Scene(), rows, [None] * 4, 0.0, feet()) == [FLOOR] * 4
+    assert matched(Scene(boxes=(step,)), rows, ["step", None, None, None], 0.0, feet())[0] == "step"
+
+
+def test_a_box_without_a_place_waits_for_what_is_on_no_other() -> None:
+    rows = [Support(s.foot, s.start, s.stop, s.height - 1.0) for s in supports()]
+    on = matched(Scene(boxes=(Box("bench", (0.4, 1.2)),)), rows, [None] * 4, 0.0, feet())
+    assert on == [FLOOR, None, None, FLOOR]
+
+
+def test_feet_on_one_thing_stand_at_one_height() -> None:
+    rows = [Support(s.foot, s.start, s.stop, s.height - 1.0) for s in supports()]
+    on = levels(rows, [FLOOR, "a", "a", FLOOR], 0.0, feet(), np.zeros(30))
+    heights = level_heights(rows, 0.0, on)
+    assert heights[0] == heights[3] == 0.0
+    assert heights[1] == heights[2] == pytest.approx(0.405, abs=0.006)
 
 
 def test_contacts_that_are_given_win() -> None:

@@ -37,7 +37,7 @@ class Chosen:
         clips: names of folders of true clips; empty for all.
         cameras: of :data:`egopose.scene.virtual_camera.KINDS`; ``zoom`` turns and zooms.
         noise: of :data:`NOISES`.
-        boxes: of :data:`BOXES`: whether the scene that is given has boxes, moved from their true places.
+        boxes: of :data:`BOXES`: a scene with boxes moved from their true places is given, or no scene at all.
         gap: leave 30 frames without anybody.
         physics: of :data:`PHYSICS`: whether a simulated body acts the clips out, and its boxes may change.
         folder: of the results; empty for one that is thrown away.

@@ -175,7 +175,7 @@ def _in_pixels(told: Array) -> CameraTrack:
     return CameraTrack(to_first, np.zeros(frames, dtype=bool), np.ones(frames), "similarity")
 
 
-def guessed_scene(true: Scene, kind: str, turn: float, start: Array, rng: np.random.Generator | None) -> Scene:
+def guessed_scene(true: Scene, kind: str, turn: float, start: Array, rng: np.random.Generator) -> Scene:
     """A user's first guess: boxes up to 0.2 m off in height and 0.15 m in place, and how the camera moves.
 
     Args:
@@ -183,9 +183,9 @@ def guessed_scene(true: Scene, kind: str, turn: float, start: Array, rng: np.ran
         kind: of the camera.
         turn: of :class:`Sight`.
         start: ``[2]`` m, the true pelvis in the first frame: the origin of the guessed scene.
-        rng: of the errors; None for a scene without boxes.
+        rng: of the errors.
     """
-    boxes = () if rng is None else tuple(_guessed(box, turn, start, rng) for box in true.boxes)
+    boxes = tuple(_guessed(box, turn, start, rng) for box in true.boxes)
     return Scene(fps=true.fps, camera=CameraNotes(motion=kind), boxes=boxes)
 
 

@@ -127,13 +127,13 @@ def observe(humanoid: HumanoidModel, clip: TrueClip, view: View, folder: Path) -
     noise = replace(_NOISE[view.noise], gap=GAP if view.gap else 0)
     motion = Motion(humanoid.skeleton, clip.simulated.qpos, clip.scene.fps, clip.name)
     sight = seen(motion, view.camera, noise, rng)
-    guess = rng if view.boxes == "guessed" else None
-    scene = guessed_scene(clip.scene, view.camera, sight.turn, motion.qpos[0, :2], guess)
     out = folder / "seen"
     out.mkdir(parents=True, exist_ok=True)
     sight.track.save(out / "poses.npz")
     save_camera(sight.camera, out / "camera.npz")
-    write_scene(scene, out / "scene.yaml")
+    if view.boxes == "guessed":
+        scene = guessed_scene(clip.scene, view.camera, sight.turn, motion.qpos[0, :2], rng)
+        write_scene(scene, out / "scene.yaml")
     (out / "turn.json").write_text(json.dumps({"turn": sight.turn}))
 
 
@@ -141,7 +141,9 @@ def prepare(folder: Path) -> None:
     """``egopose reconstruct prepare`` on ``folder/seen``; results go to ``folder``."""
     seen_in = folder / "seen"
     words = [f"poses={seen_in / 'poses.npz'}", f"camera.track={seen_in / 'camera.npz'}"]
-    words += [f"scene={seen_in / 'scene.yaml'}", f"out={folder}", "page.moments=4", "page.height=200"]
+    words += [f"out={folder}", "page.moments=4", "page.height=200"]
+    if (seen_in / "scene.yaml").is_file():
+        words.append(f"scene={seen_in / 'scene.yaml'}")
     values = compose_config("reconstruct", words)
     prepare_scene(values, write_scene_page)
 

@@ -156,8 +156,8 @@ def fitted_scene(agents: Sequence[Agent], out: Path) -> str | None:
     values = []
     for agent in agents:
         window = window_of(agent.config, clip)
-        last = agent.dataset.train[0].stop - 1
-        values.append(window_value(agent, ranges, window.start, min(window.hand_over, last)))
+        hands_over = window.hand_over < len(clip)
+        values.append(window_value(agent, ranges, window.start, window.hand_over if hands_over else None))
     fit = fit_parameters(values, ranges.size)
     change = ranges.change_of(torch.from_numpy(fit.parameters))
     tops, headings = ranges.changed(change)

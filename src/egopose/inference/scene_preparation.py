@@ -21,7 +21,7 @@ from egopose.data.preparation import humanoid_of
 from egopose.inference import scene_stages as stages
 from egopose.inference.progress import StageProgress
 from egopose.inference.scene_stages import Advance, Sources
-from egopose.scene.scene_file import Scene, read_scene
+from egopose.scene.scene_file import Scene, read_scene, tells_boxes
 from egopose.vision.video import probe_video
 
 #: What a frame costs in each stage, ms: measured on two cores on a film of 1000 x 800 px.
@@ -71,7 +71,7 @@ def prepare_scene(
 
         source, folder = sources.name, store.folder
         told, camera = _of_contacts(scene), _of_camera(scene)
-        given = edited or values["scene"] is not None
+        given = edited or (values["scene"] is not None and tells_boxes(Path(str(values["scene"])).expanduser()))
         boxes = [repr(box) for box in scene.boxes] if given else None
         run("poses", inputs["poses"], lambda advance, part: stages.find_poses(values, sources, advance, part))
         run(

@@ -286,7 +286,7 @@ def _levels(scene: Scene, given: bool, root: KinematicRoot, feet: Array, floor: 
     soles = (root.positions[:, None, None] + feet).mean(axis=2)[..., :2]
     touches: list[str | None] = touched(scene, root.supports)
     if given:
-        touches = [*matched(scene, root.supports, touches, floor, soles)]
+        touches = matched(scene, root.supports, touches, floor, soles)
     return levels(root.supports, touches, floor, soles, rot.yaw(motion.qpos[:, 3:7]))
 
 
@@ -382,7 +382,7 @@ def fill_scene(folder: Path, scene: Scene, given: bool, humanoid: HumanoidModel,
     soles = sole_points(humanoid, body).mean(axis=2)[..., :2]
     touches: list[str | None] = touched(scene, supports)
     if given:
-        touches = [*matched(scene, supports, touches, 0.0, soles)]
+        touches = matched(scene, supports, touches, 0.0, soles)
     on = levels(supports, touches, 0.0, soles, rot.yaw(body.qpos[:, 3:7]))
     filled = filled_scene(scene, supports, touches, on)
     fit = json.loads((folder / "fit.json").read_text())

@@ -214,6 +214,16 @@ def read_scene(path: str | Path) -> Scene:
         raise InputError(path, error.field, error.cause) from None
 
 
+def tells_boxes(path: str | Path) -> bool:
+    """Whether a scene file says which boxes there are, and be it none (``boxes: []``).
+
+    Raises:
+        InputError: no such file, or no YAML.
+    """
+    values = read_yaml(Path(path), "scene")
+    return isinstance(values, dict) and values.get("boxes") is not None
+
+
 def write_scene(scene: Scene, path: str | Path) -> None:
     """Write a scene file that :func:`read_scene` reads, whole or not at all.
 

@@ -93,19 +93,21 @@ def touched(scene: Scene, supports: Sequence[Support]) -> list[str | None]:
 
 def matched(
     scene: Scene, supports: Sequence[Support], touches: Sequence[str | None], floor: float, feet: Array
-) -> list[str]:
+) -> list[str | None]:
     """What each support is on where a scene tells all boxes there are: one of them, or the floor.
 
     A box counts as far away as its upper face is from where the foot stood, and as its height is from the support's.
+    Where a box has no place yet, supports above the floor that are on no other are left open (None): it may be theirs.
 
     Args:
-        scene: with its boxes; one without a place takes no support.
+        scene: with its boxes.
         supports: of the kinematic root.
         touches: of :func:`touched`: what is said stays.
         floor: m, of :func:`floor_height`.
         feet: ``[T, 2, 2]`` m, where the right and the left foot are.
     """
-    out = []
+    out: list[str | None] = []
+    waits = any(box.place is None for box in scene.boxes)
     for support, said in zip(supports, touches, strict=True):
         height, place = support.height - floor, _place(support, feet)
         away = {FLOOR: abs(height) / _STEP}
@@ -114,7 +116,8 @@ def matched(
                 beside = float(np.linalg.norm(np.maximum(np.abs(_in_box(box, place)) - 0.5 * np.array(box.size), 0.0)))
                 off = 0.0 if box.height is None else abs(height - box.height)
                 away[box.name] = beside / _BESIDE + off / _ALIKE
-        out.append(said or min(away, key=lambda name: away[name]))
+        nearest = min(away, key=lambda name: away[name])
+        out.append(said or (None if waits and nearest == FLOOR and height >= _STEP else nearest))
     return out
 
 
