@@ -122,6 +122,10 @@ def test_feet_stand_on_the_boxes_that_a_scene_tells_or_on_its_floor() -> None:
     step = Box("step", (0.5, 0.8), place=(1.0, 0.0), height=0.55, yaw=0.0)
     on = matched(Scene(boxes=(step,)), rows, [None] * 4, 0.0, feet())
     assert on == [FLOOR, "step", "step", FLOOR]
+    # Nobody stands on the floor in the middle of a box, however low the box was guessed.
+    wide = Box("wide", (1.5, 1.5), place=(1.0, 0.0), height=0.3, yaw=0.0)
+    low = [Support(1, 12, 18, 0.05)]
+    assert matched(Scene(boxes=(wide,)), low, [None], 0.0, feet()) == ["wide"]
     assert matched(Scene(), rows, [None] * 4, 0.0, feet()) == [FLOOR] * 4
     assert matched(Scene(boxes=(step,)), rows, ["step", None, None, None], 0.0, feet())[0] == "step"
 

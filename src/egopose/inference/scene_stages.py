@@ -261,7 +261,9 @@ def place_root(folder: Path, source: Path, scene: Scene, given: bool, humanoid: 
     motion, touching = read_native(folder / "motion.npz"), touching_of(folder, scene)
     if not touching.any():
         raise InputError(source, "contacts", "no foot touches anything: say which frames do in the scene file")
-    root, seen, focal = _seen_root(folder, motion, touching, humanoid, scene)
+    # Where a scene tells the boxes, supports on one thing are put together by it, and not by their heights.
+    settings = replace(_ROOT, level=0.0, level_in_flight=0.0) if given else _ROOT
+    root, seen, focal = _seen_root(folder, motion, touching, humanoid, scene, settings)
     feet, com = _about_pelvis(motion, humanoid)
     floor = floor_height(root.supports, touched(scene, root.supports))
     on = _levels(scene, given, root, feet, floor, motion)
@@ -298,7 +300,12 @@ def _about_pelvis(motion: Motion, humanoid: HumanoidModel) -> tuple[Array, Array
 
 
 def _seen_root(
-    folder: Path, motion: Motion, touching: NDArray[np.bool_], humanoid: HumanoidModel, scene: Scene
+    folder: Path,
+    motion: Motion,
+    touching: NDArray[np.bool_],
+    humanoid: HumanoidModel,
+    scene: Scene,
+    settings: RootSettings,
 ) -> tuple[KinematicRoot, SeenPlaces | None, float | None]:
     """The root by feet, gravity and pictures; what pictures tell, with the focal length (px) that suits them best.
 
@@ -308,12 +315,12 @@ def _seen_root(
     track = load_track(folder / "joints.npz")
     size, pelvis = track.image_size, track.pixels[:, BODY_25.index("mid_hip")]
     if size is None or camera_moves(folder, scene) == "track" or not np.isfinite(pelvis).any():
-        return kinematic_root(feet, touching, com, motion.fps, _ROOT), None, None
+        return kinematic_root(feet, touching, com, motion.fps, settings), None, None
     usual = focal_length(size, scene.camera.field_of_view)
     found = []
     for factor in _LENSES if scene.camera.field_of_view is None else (1.0,):
         seen = _seen_places(folder, motion, scene, factor * usual)
-        root = kinematic_root(feet, touching, com, motion.fps, _ROOT, seen)
+        root = kinematic_root(feet, touching, com, motion.fps, settings, seen)
         found.append((root.misfit + (np.log(factor) / _LENS) ** 2, factor * usual, root, seen))
     _, focal, root, seen = min(found, key=lambda one: one[0])
     return root, seen, focal

@@ -20,6 +20,8 @@ _STEP = 0.15
 _REACH, _ALIKE = 1.2, 0.25
 #: m: a foot this far beside a box counts as one that is wrong in height by as much as levels may differ.
 _BESIDE = 0.2
+#: m: likewise, of the way out of a box for a foot that should stand on the floor: places are known better than heights.
+_INSIDE = 0.1
 #: m around the feet that stood on a box that nobody described, and its least side.
 _MARGIN, _LEAST_SIDE = 0.2, 0.5
 
@@ -96,8 +98,8 @@ def matched(
 ) -> list[str | None]:
     """What each support is on where a scene tells all boxes there are: one of them, or the floor.
 
-    A box counts as far away as its upper face is from where the foot stood, and as its height is from the support's.
-    Where a box has no place yet, supports above the floor that are on no other are left open (None): it may be theirs.
+    A box counts as far away as its upper face is from where the foot stood, and as its height is from the support's. The
+    floor is as far away as the foot's height over it, and as the way out of the boxes that stand there. Where a box has no place yet, supports above the floor that are on no other are left open (None): it may be theirs.
 
     Args:
         scene: with its boxes.
@@ -113,9 +115,10 @@ def matched(
         away = {FLOOR: abs(height) / _STEP}
         for box in scene.boxes:
             if box.place is not None:
-                beside = float(np.linalg.norm(np.maximum(np.abs(_in_box(box, place)) - 0.5 * np.array(box.size), 0.0)))
+                past = np.abs(_in_box(box, place)) - 0.5 * np.array(box.size)
                 off = 0.0 if box.height is None else abs(height - box.height)
-                away[box.name] = beside / _BESIDE + off / _ALIKE
+                away[box.name] = float(np.linalg.norm(np.maximum(past, 0.0))) / _BESIDE + off / _ALIKE
+                away[FLOOR] += max(-float(past.max()), 0.0) / _INSIDE
         nearest = min(away, key=lambda name: away[name])
         out.append(said or (None if waits and nearest == FLOOR and height >= _STEP else nearest))
     return out
