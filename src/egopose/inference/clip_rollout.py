@@ -133,8 +133,8 @@ def after(rollout: ClipRollout, before: SimulatedMotion) -> SimulatedMotion:
 
 
 def until(motion: SimulatedMotion, frames: int) -> SimulatedMotion:
-    """The first ``frames`` of a motion, at least one."""
-    last = max(1, frames)
+    """The first ``frames`` of a motion, at least two."""
+    last = max(2, frames)
     return SimulatedMotion(
         motion.qpos[:last], motion.qvel[:last], motion.ctrl[: last - 1], motion.box_tops, motion.box_headings
     )
