@@ -18,11 +18,10 @@ from egopose.core.errors import InputError
 from egopose.evaluation import reconstruction_pictures
 from egopose.evaluation.position_metrics import foot_slide
 from egopose.evaluation.reconstruction_findings import Findings
-from egopose.evaluation.reconstruction_page import FITTED, PAGE
 from egopose.evaluation.reconstruction_pictures import film_panels, moment_grids, view_of
 from egopose.evaluation.reports import run_report
 from egopose.evaluation.scene_pictures import read_moments
-from egopose.inference.reconstruction import read_reconstruction
+from egopose.inference.reconstruction import FITTED, PAGE, read_reconstruction
 from egopose.inference.scene_stages import Sources, load_projection
 from egopose.report import main
 from egopose.scene.projection import Projection

@@ -39,8 +39,9 @@ from egopose.data.preparation import humanoid_of
 from egopose.evaluation.scene_metrics import SceneMotion, scene_figures
 from egopose.evaluation.scene_page import write_scene_page
 from egopose.humanoid.model import HumanoidModel
+from egopose.inference.reconstruction import PLAN
 from egopose.inference.scene_preparation import prepare_scene
-from egopose.inference.scene_recovery import PLAN, recover_scene
+from egopose.inference.scene_recovery import recover_scene
 from egopose.motion.motion import Motion
 from egopose.scene.camera_file import save_camera
 from egopose.scene.clip import Clip, read_clip

@@ -15,15 +15,11 @@ from egopose.evaluation.charts import Chart, Line, line_chart
 from egopose.evaluation.page import Film, Number, Table, render
 from egopose.evaluation.reconstruction_findings import Findings
 from egopose.evaluation.scene_pictures import Moments, read_moments
-from egopose.inference.reconstruction import Reconstruction
+from egopose.inference.reconstruction import FITTED, Reconstruction
 from egopose.inference.scene_stages import Sources, film_of, load_projection
 from egopose.scene.movement_numbers import Row
 from egopose.scene.scene_file import Box, read_scene
 from egopose.vision.video import Frame
-
-#: Beside ``scene.yaml``: the scene after fitting.
-FITTED = "scene.fitted.yaml"
-PAGE = "reconstruction.html"
 
 
 @dataclass(frozen=True)

@@ -19,9 +19,9 @@ from egopose.core.errors import InputError
 from egopose.data.preparation import humanoid_of
 from egopose.envs.starts import Piece
 from egopose.evaluation import position_metrics
-from egopose.evaluation.reconstruction_page import PAGE
 from egopose.evaluation.reports import rollout_report
 from egopose.inference.clip_rollout import ClipRollout, after, joined, roll_out, until
+from egopose.inference.reconstruction import PAGE
 from egopose.inference.scene_values import window_value
 from egopose.motion.motion import Motion
 from egopose.motion.rotations import Array

@@ -16,11 +16,11 @@ from egopose.core.errors import InputError
 from egopose.core.safe_io import read_json
 from egopose.evaluation.estimation_page import ReportSettings, write_report
 from egopose.evaluation.forecast_page import write_forecast_page
-from egopose.evaluation.reconstruction_page import PAGE, ReconstructionPageSettings, write_reconstruction_page
+from egopose.evaluation.reconstruction_page import ReconstructionPageSettings, write_reconstruction_page
 from egopose.evaluation.sweep_report import SweepSettings, write_sweep_report
 from egopose.humanoid.model import HumanoidModel
 from egopose.inference.export import humanoid_for
-from egopose.inference.reconstruction import read_reconstruction, reconstruction_folder, simulated_humanoid
+from egopose.inference.reconstruction import PAGE, read_reconstruction, reconstruction_folder, simulated_humanoid
 
 _SOURCE = "conf/report.yaml"
 

@@ -17,7 +17,8 @@ from egopose.scene.movement_numbers import MovementNumbers, movement_numbers
 from egopose.scene.scene_file import Box, Scene
 from egopose.scene.simulated import SimulatedMotion, load_simulated
 
-PLAN = "plan.npz"
+#: What `egopose reconstruct` leaves beside the prepared clip: the simulated motion, the scene after fitting, the page.
+PLAN, FITTED, PAGE = "plan.npz", "scene.fitted.yaml", "reconstruction.html"
 
 
 @dataclass(frozen=True, eq=False)

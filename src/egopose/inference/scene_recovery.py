@@ -20,13 +20,14 @@ from egopose.core.stages import StageFolder
 from egopose.data.preparation import humanoid_of
 from egopose.inference.motion_cost import TERMS
 from egopose.inference.progress import StageProgress
+from egopose.inference.reconstruction import FITTED, PAGE, PLAN
 from egopose.inference.sampled_motion import Found, SamplingSettings
 from egopose.inference.scene_motion import recovered
 from egopose.pipeline.agent import load_policy
 from egopose.scene.clip import read_clip
 from egopose.scene.scene_file import FREE, Box, Scene, write_scene
 
-PLAN, FITTED, SEARCH, PAGE = "plan.npz", "scene.fitted.yaml", "search.json", "reconstruction.html"
+SEARCH = "search.json"
 #: What a frame costs in each stage, ms: measured on two cores beside other work.
 _COSTS = {"physics": 400.0, "report": 60.0}
 #: Changes with what the stages compute from the same inputs.
