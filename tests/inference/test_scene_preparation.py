@@ -180,10 +180,10 @@ def test_a_scene_at_another_rate_is_refused(tmp_path: Path) -> None:
         prepare_scene(settings(tmp_path, *words), no_page)
 
 
-def test_the_verb_says_what_it_can_do() -> None:
+def test_the_verb_says_what_it_needs() -> None:
     done = subprocess.run([sys.executable, "-m", "egopose.reconstruct"], capture_output=True, text=True, check=False)
     assert done.returncode == 2
-    assert "say what to do: prepare" in done.stderr
+    assert "video=FILM, or poses=FOLDER" in done.stderr
 
 
 def moved_by(frames: int, pixels: float) -> CameraTrack:

@@ -21,7 +21,7 @@ from egopose.envs.starts import Piece
 from egopose.evaluation.reconstruction_run import one_after_the_other
 from egopose.evaluation.run import evaluate
 from egopose.humanoid.physics import BatchedPhysics
-from egopose.inference.clip_rollout import after, roll_out
+from egopose.inference.clip_rollout import after, roll_out, until
 from egopose.inference.scene_values import window_value
 from egopose.pipeline.agent import Agent, load_agent
 from egopose.scene.clip import read_clip
@@ -154,6 +154,9 @@ def test_a_rollout_of_a_later_window_goes_on_from_what_was_before(run: Path) -> 
     np.testing.assert_array_equal(rollout.motion.qpos[0], plan.qpos[4])
     whole = after(rollout, plan)
     assert len(whole) == 10
+    cut = until(whole, 7)
+    assert (len(cut.qpos), len(cut.qvel), len(cut.ctrl)) == (7, 7, 6)
+    assert len(until(whole, 0)) == 2
     np.testing.assert_array_equal(whole.qpos[:5], plan.qpos[:5])
 
 

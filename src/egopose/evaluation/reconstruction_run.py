@@ -20,7 +20,7 @@ from egopose.data.preparation import humanoid_of
 from egopose.envs.starts import Piece
 from egopose.evaluation import position_metrics
 from egopose.evaluation.reports import rollout_report
-from egopose.inference.clip_rollout import ClipRollout, after, joined, roll_out
+from egopose.inference.clip_rollout import ClipRollout, after, joined, roll_out, until
 from egopose.inference.reconstruction import PAGE
 from egopose.inference.scene_values import window_value
 from egopose.motion.motion import Motion
@@ -77,7 +77,8 @@ def run_reconstruction(
     for number, agent in enumerate(agents):
         fragment = agent.dataset.train[0]
         rollout = _acted_out(agent, Piece(0, fragment.start, fragment.stop), threads)
-        lines.append(_kept(rollout, agent, out if len(agents) == 1 else out / str(number)))
+        window = agent.config["task"]["window"] is not None
+        lines.append(_kept(rollout, agent, out if len(agents) == 1 else out / str(number), until_it_ends=window))
     if len(agents) > 1:
         lines.append("one after the other:\n" + _kept(one_after_the_other(agents, threads), agents[0], out))
     fit = fitted_scene(agents, out)
@@ -120,12 +121,18 @@ def _acted_out(agent: Agent, piece: Piece, threads: int, state: tuple[Array, Arr
     return rollout
 
 
-def _kept(rollout: ClipRollout, agent: Agent, folder: Path) -> str:
-    """Leave motion and figures in ``folder``; lines for the terminal."""
+def _kept(rollout: ClipRollout, agent: Agent, folder: Path, until_it_ends: bool = False) -> str:
+    """Leave motion and figures in ``folder``; lines for the terminal.
+
+    With ``until_it_ends`` the motion is cut where an ending would have ended it: the next window's policy begins in its
+    states.
+    """
     folder.mkdir(parents=True, exist_ok=True)
     assert isinstance(agent.dataset, ClipDataset)
     figures, plan = figures_of(rollout, agent.dataset), agent.dataset.plan
     motion = rollout.motion if plan is None else after(rollout, plan)
+    if until_it_ends:
+        motion = until(motion, rollout.first + rollout.survived)
     motion.save(folder / MOTION)
     write_text_whole(folder / FIGURES, json.dumps(figures, indent=1))
     return f"{summary(figures)}\nmotion: {folder / MOTION}"

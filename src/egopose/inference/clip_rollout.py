@@ -130,3 +130,11 @@ def after(rollout: ClipRollout, before: SimulatedMotion) -> SimulatedMotion:
         motion.box_tops,
         motion.box_headings,
     )
+
+
+def until(motion: SimulatedMotion, frames: int) -> SimulatedMotion:
+    """The first ``frames`` of a motion, at least two."""
+    last = max(2, frames)
+    return SimulatedMotion(
+        motion.qpos[:last], motion.qvel[:last], motion.ctrl[: last - 1], motion.box_tops, motion.box_headings
+    )

@@ -98,8 +98,9 @@ def matched(
 ) -> list[str | None]:
     """What each support is on where a scene tells all boxes there are: one of them, or the floor.
 
-    A box counts as far away as its upper face is from where the foot stood, and as its height is from the support's. The
-    floor is as far away as the foot's height over it, and as the way out of the boxes that stand there. Where a box has no place yet, supports above the floor that are on no other are left open (None): it may be theirs.
+    A box is as far away as its upper face from where the foot stood, and as its height from the support's. The floor
+    is as far away as the foot's height over it, and as the way out of the boxes that stand there. Where a box has no
+    place yet, supports above the floor that are on no other are left open (None): it may be theirs.
 
     Args:
         scene: with its boxes.
