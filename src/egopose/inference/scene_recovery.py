@@ -7,6 +7,7 @@ still fits is not made again.
 from __future__ import annotations
 
 import json
+import time
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -66,8 +67,10 @@ def recover_scene(values: Mapping[str, Any], folder: Path, write_report: Callabl
         if not store.done("physics", inputs):
             with progress.stage("physics") as advance:
                 share = _Share(settings.passes + 1, advance)
+                began = time.perf_counter()
                 found = recovered(folder, clip, humanoid, policy, settings, free, share)
-                store.make("physics", inputs, lambda part: _keep(found, clip.scene, part))
+                seconds = time.perf_counter() - began
+                store.make("physics", inputs, lambda part: _keep(found, clip.scene, seconds, part))
         told = {PLAN: store.digest(PLAN), FITTED: store.digest(FITTED), "version": _VERSION}
         if not store.done("report", told):
             with progress.stage("report"):
@@ -95,13 +98,14 @@ def _digest(checkpoint: Path) -> str:
     return (checkpoint / "checksums.json").read_text(encoding="utf8")
 
 
-def _keep(found: Found, scene: Scene, out: Path) -> None:
+def _keep(found: Found, scene: Scene, seconds: float, out: Path) -> None:
     found.motion.save(out / PLAN)
     write_scene(fitted(scene, found), out / FITTED)
     spread = found.changes.std(axis=0)
     told = {
         "cost": dict(zip(TERMS, found.cost.mean(axis=0).tolist(), strict=True)),
         "total": float(found.totals[0]),
+        "seconds": seconds,
         "boxes": {
             box.name: {
                 name: {"change": float(found.change[k, c]), "spread": float(spread[k, c])}
