@@ -1,4 +1,4 @@
-"""``python experiments/scene_fit/table.py BENCH_JSON``: ``result.json`` and README.md's table from the bench's JSON."""
+"""``python experiments/scene_fit/table.py BENCH_JSON ...``: ``result.json`` and README.md's table from the bench."""
 
 from __future__ import annotations
 
@@ -27,19 +27,20 @@ MOTIONS = {"kinematic": "kinematic", "simulated, given": "given", "simulated, fi
 
 def main() -> None:
     """The command."""
-    rows = [row for row in json.loads(Path(sys.argv[1]).read_text())["rows"] if "failed" not in row]
-    result: dict[str, dict[str, Any]] = {}
+    results = [json.loads(Path(word).read_text()) for word in sys.argv[1:]]
+    rows = [row for result in results for row in result["rows"] if "failed" not in row]
+    kept: dict[str, dict[str, Any]] = {}
     lines = [["clip", "motion", *(head for _, head, _ in FIGURES.values()), "minutes"]]
     lines.append(["---"] * 2 + ["---:"] * (len(FIGURES) + 1))
     for row in rows:
         told = {name: row[key] for key, (name, _, _) in FIGURES.items()}
         if "seconds" in row:
             told["wall_clock_h"] = row["seconds"] / 3600.0
-        result.setdefault(row["clip"], {})[MOTIONS[row["motion"]]] = told
+        kept.setdefault(row["clip"], {})[MOTIONS[row["motion"]]] = told
         values = [_said(row[key], decimals) for key, (_, _, decimals) in FIGURES.items()]
         minutes = _said(row["seconds"] / 60.0, 1) if "seconds" in row else ""
         lines.append([row["clip"], MOTIONS[row["motion"]], *values, minutes])
-    (HERE / "result.json").write_text(json.dumps(result, indent=1) + "\n")
+    (HERE / "result.json").write_text(json.dumps(kept, indent=1) + "\n")
     table = "\n".join(f"| {' | '.join(line)} |" for line in lines)
     page = HERE / "README.md"
     before, _, rest = page.read_text().partition("<!-- table -->")
