@@ -45,8 +45,8 @@ from egopose.inference.scene_recovery import SEARCH, recover_scene
 from egopose.motion.motion import Motion
 from egopose.scene.camera_file import save_camera
 from egopose.scene.clip import Clip, read_clip
-from egopose.scene.scene_file import Scene, write_scene
-from egopose.scene.simulated import SimulatedMotion, load_simulated
+from egopose.scene.scene_file import write_scene
+from egopose.scene.simulated import as_simulated, load_simulated
 
 __all__ = ["run", "tables"]
 
@@ -185,20 +185,11 @@ def judged(humanoid: HumanoidModel, clip: TrueClip, folder: Path, acted: Sequenc
 
 def _simulated(path: Path, found: Clip, humanoid: HumanoidModel) -> SceneMotion:
     plan = load_simulated(path)
-    scene = _with_tops(found.scene, plan)
+    scene = as_simulated(found.scene, plan)
     feet = simulated_feet(path, plan, scene, humanoid)
     if len(plan) != len(found):
         raise InputError(path, "qpos", f"{len(plan)} frames; body.npz has {len(found)}")
     return SceneMotion(Motion(humanoid.skeleton, plan.qpos, found.body.fps), feet, scene)
-
-
-def _with_tops(scene: Scene, plan: SimulatedMotion) -> Scene:
-    """The scene with its boxes where the simulation had them."""
-    moved = [
-        replace(box, place=(float(top[0]), float(top[1])), height=float(top[2]), yaw=float(heading))
-        for box, top, heading in zip(scene.boxes, plan.box_tops, plan.box_headings, strict=False)
-    ]
-    return replace(scene, boxes=(*moved, *scene.boxes[len(moved) :]))
 
 
 @contextmanager

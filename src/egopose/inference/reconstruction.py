@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 from egopose.core.config import compose_config
@@ -14,8 +14,8 @@ from egopose.motion.motion import Motion
 from egopose.motion.rotations import Array
 from egopose.scene.clip import Clip, box_poses, humanoid_in, read_clip
 from egopose.scene.movement_numbers import MovementNumbers, movement_numbers
-from egopose.scene.scene_file import Box, Scene
-from egopose.scene.simulated import SimulatedMotion, load_simulated
+from egopose.scene.scene_file import Scene
+from egopose.scene.simulated import as_simulated, load_simulated
 
 #: What `egopose reconstruct` leaves beside the prepared clip: the simulated motion, the scene after fitting, the page.
 PLAN, FITTED, PAGE = "plan.npz", "scene.fitted.yaml", "reconstruction.html"
@@ -100,22 +100,9 @@ def read_reconstruction(folder: Path, humanoid: HumanoidModel, path: Path | None
         folder,
         path,
         clip,
-        _as_simulated(clip.scene, simulated),
+        as_simulated(clip.scene, simulated),
         among,
         with_replayed_forces(bare, among, forces),
         forces,
         numbers,
     )
-
-
-def _as_simulated(scene: Scene, simulated: SimulatedMotion) -> Scene:
-    boxes = (
-        _moved(box, top, float(heading))
-        for box, top, heading in zip(scene.boxes, simulated.box_tops, simulated.box_headings, strict=True)
-    )
-    return replace(scene, boxes=tuple(boxes))
-
-
-def _moved(box: Box, top: Array, heading: float) -> Box:
-    x, y, height = top.tolist()
-    return replace(box, place=(x, y), height=height, yaw=heading)

@@ -53,7 +53,7 @@ class SamplingSettings:
     kept: int
     piece: int
     passes: int
-    deviation: Mapping[str, float]
+    deviation: dict[str, float]
     narrowing: float
     memory: float
     value: float
@@ -74,8 +74,7 @@ class SamplingSettings:
     def from_config(cls, values: Mapping[str, Any]) -> SamplingSettings:
         """Raises InputError: a value is missing, unknown or wrong."""
         cost = from_mapping(CostWeights, values["cost"], "conf/reconstruct.yaml: sampling.cost")
-        deviation = {str(name): float(value) for name, value in values["deviation"].items()}
-        return cls(**{**values, "cost": cost, "deviation": deviation})
+        return from_mapping(cls, {**values, "cost": cost}, "conf/reconstruct.yaml: sampling")
 
 
 @dataclass(frozen=True)

@@ -128,11 +128,7 @@ def free_boxes(scene: Scene, stands: Standing, places: Array, free: bool) -> Fre
     ranges = ranges if free else np.zeros_like(ranges)
     sizes = np.array([box.size for box in scene.boxes]).reshape(-1, 2)
     needed = np.array([_needed(k, tops, sizes, stands, places) for k in range(len(tops))], dtype=np.int64)
-    seen = (
-        np.stack([_suits(k, tops, headings, sizes, stands) for k in range(len(tops))])
-        if len(tops)
-        else np.zeros((0, 4))
-    )
+    seen = np.array([_suits(k, tops, headings, sizes, stands) for k in range(len(tops))]).reshape(-1, 4)
     low, high = ranges[..., 0], ranges[..., 1]
     return FreeBoxes(tops, headings, sizes, low, high, np.clip(seen, low, high), _SPREAD, needed)
 

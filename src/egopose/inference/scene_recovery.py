@@ -13,8 +13,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from egopose.checkpoint.pretrained import FOLDER
 from egopose.core.config import convert
 from egopose.core.stages import StageFolder
@@ -27,6 +25,7 @@ from egopose.inference.scene_motion import recovered
 from egopose.pipeline.agent import load_policy
 from egopose.scene.clip import read_clip
 from egopose.scene.scene_file import FREE, Box, Scene, write_scene
+from egopose.scene.simulated import as_simulated
 
 SEARCH = "search.json"
 #: What a frame costs in each stage, ms: measured on two cores beside other work.
@@ -120,20 +119,19 @@ def _keep(found: Found, scene: Scene, seconds: float, out: Path) -> None:
 
 def fitted(scene: Scene, found: Found) -> Scene:
     """The scene with its boxes where the best body had them; what may still change shrinks to what is left of it."""
-    motion = found.motion
-    boxes = [
-        _moved(box, motion.box_tops[k], float(motion.box_headings[k]), found.change[k])
-        for k, box in enumerate(scene.boxes)
-    ]
-    return replace(scene, boxes=tuple(boxes))
+    moved = as_simulated(scene, found.motion)
+    return replace(moved, boxes=tuple(map(_as_found, moved.boxes, found.change.tolist())))
 
 
-def _moved(box: Box, top: np.ndarray, heading: float, change: np.ndarray) -> Box:
+def _as_found(box: Box, change: list[float]) -> Box:
     left = {
         name: (min(low - by, 0.0), max(high - by, 0.0))
-        for name, by in zip(FREE, change.tolist(), strict=True)
-        for low, high in [box.free.get(name, (0.0, 0.0))]
+        for name, by in zip(FREE, change, strict=True)
         if name in box.free
+        for low, high in [box.free[name]]
     }
-    place = (round(float(top[0]), 4), round(float(top[1]), 4))
-    return replace(box, place=place, height=round(float(top[2]), 4), yaw=round(heading, 4), free=left)
+    assert box.place is not None
+    assert box.height is not None
+    assert box.yaw is not None
+    x, y = box.place
+    return replace(box, place=(round(x, 4), round(y, 4)), height=round(box.height, 4), yaw=round(box.yaw, 4), free=left)

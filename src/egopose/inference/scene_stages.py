@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -266,7 +266,8 @@ def place_root(folder: Path, source: Path, scene: Scene, given: bool, humanoid: 
     root, seen, focal = _seen_root(folder, motion, touching, humanoid, scene, settings)
     feet, com = _about_pelvis(motion, humanoid)
     floor = floor_height(root.supports, touched(scene, root.supports))
-    on = _levels(scene, given, root, feet, floor, motion)
+    soles = (root.positions[:, None, None] + feet).mean(axis=2)[..., :2]
+    _, on = _stood_on(scene, given, root.supports, floor, soles, motion.qpos)
     heights = level_heights(root.supports, floor, on)
     supports = tuple(replace(s, height=height) for s, height in zip(root.supports, heights, strict=True))
     root = on_supports(replace(root, supports=supports), feet, com, motion.fps, _ROOT, seen)
@@ -283,13 +284,14 @@ def place_root(folder: Path, source: Path, scene: Scene, given: bool, humanoid: 
     (out / "lens.json").write_text(json.dumps({"focal_px": focal}))
 
 
-def _levels(scene: Scene, given: bool, root: KinematicRoot, feet: Array, floor: float, motion: Motion) -> list[Level]:
-    """What the body stands on beside the floor; ``feet`` about the pelvis."""
-    soles = (root.positions[:, None, None] + feet).mean(axis=2)[..., :2]
-    touches: list[str | None] = touched(scene, root.supports)
+def _stood_on(
+    scene: Scene, given: bool, supports: Sequence[Support], floor: float, soles: Array, qpos: Array
+) -> tuple[list[str | None], list[Level]]:
+    """What each support is on, and what of it is not the floor; ``soles [T, 2, 2]`` m are the feet's places."""
+    touches = touched(scene, supports)
     if given:
-        touches = matched(scene, root.supports, touches, floor, soles)
-    return levels(root.supports, touches, floor, soles, rot.yaw(motion.qpos[:, 3:7]))
+        touches = matched(scene, supports, touches, floor, soles)
+    return touches, levels(supports, touches, floor, soles, rot.yaw(qpos[:, 3:7]))
 
 
 def _about_pelvis(motion: Motion, humanoid: HumanoidModel) -> tuple[Array, Array]:
@@ -317,26 +319,24 @@ def _seen_root(
     if size is None or camera_moves(folder, scene) == "track" or not np.isfinite(pelvis).any():
         return kinematic_root(feet, touching, com, motion.fps, settings), None, None
     usual = focal_length(size, scene.camera.field_of_view)
+    camera, moves = clip_camera(folder), camera_moves(folder, scene)
+    hips = _held(camera.redo(track.pixels)[:, BODY_25.index("mid_hip")])
+    told = json.loads((folder / "fit.json").read_text())
+    first = first_to_world(told["pitch"], told["roll"])
+    # Pixels a metre in the frame's own picture, whose focal length is the first one's and the zoom.
+    scale = camera.size() * np.linalg.norm(_projection(folder, motion).matrix[:, 0], axis=1)
     found = []
     for factor in _LENSES if scene.camera.field_of_view is None else (1.0,):
-        seen = _seen_places(folder, motion, scene, factor * usual)
+        focal = factor * usual
+        seen = _seen_places(first @ view_turns(hips, camera, moves, size, focal), focal / scale)
         root = kinematic_root(feet, touching, com, motion.fps, settings, seen)
-        found.append((root.misfit + (np.log(factor) / _LENS) ** 2, factor * usual, root, seen))
+        found.append((root.misfit + (np.log(factor) / _LENS) ** 2, focal, root, seen))
     _, focal, root, seen = min(found, key=lambda one: one[0])
     return root, seen, focal
 
 
-def _seen_places(folder: Path, motion: Motion, scene: Scene, focal: float) -> SeenPlaces:
-    """Where the hips are, by their pixels once the camera's turning is undone, and by their size in the picture."""
-    track, camera = load_track(folder / "joints.npz"), clip_camera(folder)
-    assert track.image_size is not None
-    pelvis = _held(camera.redo(track.pixels)[:, BODY_25.index("mid_hip")])
-    turns = view_turns(pelvis, camera, camera_moves(folder, scene), track.image_size, focal)
-    told = json.loads((folder / "fit.json").read_text())
-    to_world = first_to_world(told["pitch"], told["roll"]) @ turns
-    # Pixels a metre in the frame's own picture, whose focal length is the first one's and the zoom.
-    scale = np.linalg.norm(_projection(folder, motion).matrix[:, 0], axis=1)
-    depth = focal / (camera.size() * scale)
+def _seen_places(to_world: Array, depth: Array) -> SeenPlaces:
+    """Of hips ``depth [T]`` m away, in the middle of cameras whose axes ``to_world [T, 3, 3]`` takes to the world's."""
     axes = to_world.transpose(0, 2, 1)
     return SeenPlaces(depth[:, None] * axes[:, 2], axes, depth)
 
@@ -387,10 +387,7 @@ def fill_scene(folder: Path, scene: Scene, given: bool, humanoid: HumanoidModel,
     """``scene.yaml``: the scene with what it left out. Boxes are proposed only where no scene was ``given``."""
     body, supports = read_native(folder / "body.npz"), supports_of(folder)
     soles = sole_points(humanoid, body).mean(axis=2)[..., :2]
-    touches: list[str | None] = touched(scene, supports)
-    if given:
-        touches = matched(scene, supports, touches, 0.0, soles)
-    on = levels(supports, touches, 0.0, soles, rot.yaw(body.qpos[:, 3:7]))
+    touches, on = _stood_on(scene, given, supports, 0.0, soles, body.qpos)
     filled = filled_scene(scene, supports, touches, on)
     fit = json.loads((folder / "fit.json").read_text())
     camera = replace(filled.camera, motion=fit["camera"])

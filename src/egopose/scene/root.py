@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 from scipy.ndimage import binary_dilation
 
+from egopose.motion.contacts import runs_of
 from egopose.motion.rotations import Array
 
 GRAVITY = 9.81
@@ -229,7 +230,7 @@ def _firmness(
     out = np.zeros(contacts.shape)
     frames = len(contacts)
     for foot in range(contacts.shape[1]):
-        for start, stop in _runs(contacts[:, foot]):
+        for start, stop in runs_of(contacts[:, foot]):
             inside = np.arange(start, stop)
             # The clip's ends cut contacts off: those edges are none.
             after = inside - start + 1 if start > 0 else np.full(stop - start, frames)
@@ -237,7 +238,7 @@ def _firmness(
             out[start:stop, foot] = np.minimum(1.0, np.minimum(after, before) / (settings.settling * fps)) ** 2
     lower = feet[..., 2].min(axis=2).argmin(axis=1)
     flight = np.zeros(frames, dtype=bool)
-    for start, stop in _runs(np.asarray(~contacts.any(axis=1))):
+    for start, stop in runs_of(np.asarray(~contacts.any(axis=1))):
         told = 0.0
         if start > 0 and stop < frames:
             left, landed = (_rise(steps, contacts, center_of_mass, frame, fps) for frame in (start - 1, stop))
@@ -362,7 +363,9 @@ def _levelled(lowest: Array, contacts: np.ndarray, settings: RootSettings) -> tu
         contacts: ``[T, F]``.
         settings: tell which heights are one level.
     """
-    runs = sorted((start, stop, foot) for foot in range(contacts.shape[1]) for start, stop in _runs(contacts[:, foot]))
+    runs = sorted(
+        (start, stop, foot) for foot in range(contacts.shape[1]) for start, stop in runs_of(contacts[:, foot])
+    )
     found: list[Support] = []
     for start, stop, foot in runs:
         height = float(np.median(lowest[start:stop, foot]))
@@ -377,9 +380,3 @@ def _levelled(lowest: Array, contacts: np.ndarray, settings: RootSettings) -> tu
             height = 0.0
         found.append(Support(foot, start, stop, height))
     return tuple(found)
-
-
-def _runs(mask: np.ndarray) -> list[tuple[int, int]]:
-    """``[start, stop)`` of every run of True."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], mask.astype(np.int8), [0]])))
-    return [(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +10,7 @@ import numpy as np
 from egopose.core.errors import InputError
 from egopose.motion.io._npz import read_arrays
 from egopose.motion.rotations import Array
+from egopose.scene.scene_file import Scene
 
 
 @dataclass(frozen=True)
@@ -48,6 +49,15 @@ class SimulatedMotion:
     def save(self, path: Path) -> None:
         """Write ``path``, an ``.npz`` without pickle."""
         np.savez_compressed(path, **asdict(self))
+
+
+def as_simulated(scene: Scene, motion: SimulatedMotion) -> Scene:
+    """The scene with its boxes where the simulation had them; a box that it does not have stays."""
+    moved = [
+        replace(box, place=(float(top[0]), float(top[1])), height=float(top[2]), yaw=float(heading))
+        for box, top, heading in zip(scene.boxes, motion.box_tops, motion.box_headings, strict=False)
+    ]
+    return replace(scene, boxes=(*moved, *scene.boxes[len(moved) :]))
 
 
 def load_simulated(path: Path) -> SimulatedMotion:

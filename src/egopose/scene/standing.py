@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 
+from egopose.motion.contacts import runs_of
 from egopose.motion.rotations import Array
 from egopose.scene.root import Support
 
@@ -100,7 +101,7 @@ def standing(supports: Sequence[Support], boxes: Sequence[int], feet: Array, fra
     share = np.zeros((frames, len(supports)))
     for k, support in enumerate(supports):
         share[support.start : support.stop, k] = 1.0
-    for start, stop in _runs(share.sum(axis=1) == 0):
+    for start, stop in runs_of(share.sum(axis=1) == 0):
         # At the clip's ends there is one side alone, and it holds.
         leaves = _normalised(share[start - 1] if start else share[stop])
         lands = _normalised(share[stop] if stop < frames else share[start - 1])
@@ -115,8 +116,3 @@ def standing(supports: Sequence[Support], boxes: Sequence[int], feet: Array, fra
 
 def _normalised(share: Array) -> Array:
     return share / share.sum(axis=-1, keepdims=True).clip(min=1e-12)
-
-
-def _runs(mask: NDArray[np.bool_]) -> list[tuple[int, int]]:
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], mask.astype(np.int8), [0]])))
-    return [(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)]

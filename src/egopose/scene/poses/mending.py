@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from egopose.motion.contacts import runs_of
 from egopose.motion.rotations import Array
 from egopose.scene.poses.track import Mask, PoseTrack
 
@@ -55,14 +56,15 @@ def fill_gaps(track: PoseTrack, least: float = 0.1) -> PoseTrack:
         positions, more = _interpolated(positions, np.asarray(np.isfinite(positions).all(axis=-1)))
         filled |= more
     confidence = np.where(filled, MADE_UP, track.confidence)
-    gaps = _runs(np.asarray(filled.mean(axis=1) > 0.5))
+    gaps = runs_of(np.asarray(filled.mean(axis=1) > 0.5))
     notes = [f"frames {a} to {b - 1}: nobody was found; interpolated" for a, b in gaps]
     single = int(filled.sum()) - sum(int(filled[a:b].sum()) for a, b in gaps)
     if single:
         notes.append(f"{single} single keypoints of {filled.size} were not seen; interpolated")
     nobody = ~np.isfinite(pixels).any(axis=(1, 2)) if positions is None else ~np.isfinite(positions).any(axis=(1, 2))
     notes += [
-        f"frames {a} to {b - 1}: nobody was found, at the clip's end or beginning" for a, b in _runs(np.asarray(nobody))
+        f"frames {a} to {b - 1}: nobody was found, at the clip's end or beginning"
+        for a, b in runs_of(np.asarray(nobody))
     ]
     return replace(
         track,
@@ -106,9 +108,3 @@ def _interpolated(values: Array, known: Mask) -> tuple[Array, Mask]:
             out[missing, k, axis] = np.interp(missing, at, values[at, k, axis])
         filled[missing, k] = True
     return out, filled
-
-
-def _runs(mask: Mask) -> list[tuple[int, int]]:
-    """Beginnings and ends (exclusive) of the stretches in which ``mask [T]`` is true."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]).astype(int)))
-    return [(int(a), int(b)) for a, b in edges.reshape(-1, 2)]
