@@ -6,6 +6,7 @@ from itertools import product
 
 import mujoco
 import numpy as np
+from numpy.typing import NDArray
 
 from egopose.humanoid.model import HumanoidModel
 from egopose.motion import rotations as rot
@@ -32,13 +33,28 @@ def sole_edges(humanoid: HumanoidModel, motion: Motion) -> Array:
 def _foot_corners(humanoid: HumanoidModel, motion: Motion, sides: tuple[int, ...]) -> Array:
     """``[T, feet * 4 * sides, 3]`` m: corners of every foot's box, of its underside (-1) and upper side (1)."""
     positions, quats = motion.forward_kinematics()
-    points = []
+    joints, offsets = _corners_in_feet(humanoid, sides)
+    turned = [rot.rotate(quats[:, foot], offset[None]) for foot, offset in zip(joints, offsets, strict=True)]
+    return positions[:, joints] + np.stack(turned, axis=1)
+
+
+def sole_corners(humanoid: HumanoidModel) -> tuple[NDArray[np.intp], Array]:
+    """Feet ``[feet * 4]`` of the points of :func:`sole_edges`, and their places ``[feet * 4, 3]`` m in its frame.
+
+    Of each foot the heel's two corners come first.
+    """
+    return _corners_in_feet(humanoid, (-1,))
+
+
+def _corners_in_feet(humanoid: HumanoidModel, sides: tuple[int, ...]) -> tuple[NDArray[np.intp], Array]:
+    joints, points = [], []
     for foot in humanoid.feet:
         geom = int(humanoid.mj_model.body_geomadr[humanoid.body_ids[foot]])
         centre, half = humanoid.mj_model.geom_pos[geom], humanoid.mj_model.geom_size[geom]
         for x, y, z in product((-1, 1), (-1, 1), sides):
-            points.append(positions[:, foot] + rot.rotate(quats[:, foot], (centre + half * [x, y, z])[None]))
-    return np.stack(points, axis=1)
+            joints.append(foot)
+            points.append(centre + half * [x, y, z])
+    return np.array(joints), np.array(points)
 
 
 def lowest_points(humanoid: HumanoidModel, motion: Motion) -> Array:

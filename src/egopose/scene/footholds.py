@@ -1,4 +1,4 @@
-"""Feet that stand do not slide: the poses of a film solved again so that standing soles stay where they are.
+"""Feet that stand do not slide, and no foot sinks: the poses of a film solved again with the soles on their footholds.
 
 Lifted poses tremble and stretch, so that feet slide at a metre a second under a root that is in the right place. No
 body can do that. All frames are solved at once for the body's points, soles on their footholds, and smoothness.
@@ -10,8 +10,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
-from egopose.humanoid.foot_geometry import sole_positions
+from egopose.humanoid.foot_geometry import sole_corners, sole_edges
 from egopose.humanoid.model import HumanoidModel
 from egopose.motion import rotations as rot
 from egopose.motion.inverse_kinematics import Targets
@@ -19,6 +20,8 @@ from egopose.motion.motion import Motion
 from egopose.motion.rotations import Array
 from egopose.motion.smooth_inverse_kinematics import Smoothness, solve_smooth
 from egopose.scene.root import Support
+
+_DEEP = 0.002  # m: a corner that is less deep is on the ground
 
 
 @dataclass(frozen=True)
@@ -29,9 +32,11 @@ class FootholdSettings:
         stands: of a sole's point that stands.
         body: of the body's other points, which are a few centimetres off.
         turn: m/rad, of the root's rotation.
-        lift: m: of a standing foot's two points, one that is this much higher than the other hardly stands.
+        lift: m: of a standing foot's heel and ball, one that is this much higher than the other hardly stands.
         hinges, root: what accelerations cost, see :class:`~egopose.motion.smooth_inverse_kinematics.Smoothness`.
         iterations: of the solver.
+        clear: of a sole's corner that was in the ground, at the ground's height.
+        rounds: of the solver; after each but the last, corners in the ground are found.
     """
 
     stands: float = 2.0
@@ -41,6 +46,8 @@ class FootholdSettings:
     hinges: float = 0.0007
     root: float = 0.002
     iterations: int = 8
+    clear: float = 1.0
+    rounds: int = 3
 
 
 def on_footholds(
@@ -60,39 +67,80 @@ def on_footholds(
         settings: see :class:`FootholdSettings`; None for its own values.
     """
     settings = settings or FootholdSettings()
-    names = [humanoid.skeleton.names[foot] for foot in humanoid.feet]
-    order = [names.index(name) for name in ("RightFoot", "LeftFoot")]
-    soles = sole_positions(humanoid, motion).reshape(len(motion), len(names), 2, 3)[:, order]
-    goal, weight = soles.copy(), np.zeros(soles.shape[:3])
+    corners, joints, offsets = _soles(humanoid, motion)
+    goal, weight = corners.copy(), np.zeros(corners.shape[:3])
     for support in supports:
         span, foot = slice(support.start, support.stop), support.foot
-        part = soles[span, foot]
-        stands = np.exp(-(part[..., 2] - part[..., 2].min(axis=1, keepdims=True)) / settings.lift)
+        part = corners[span, foot]
+        # Of heel and ball, not of each corner: a foot that is tilted to a side stands on both.
+        ends = np.repeat(part[..., 2].reshape(len(part), 2, 2).mean(axis=2), 2, axis=1)
+        stands = np.exp(-(ends - ends.min(axis=1, keepdims=True)) / settings.lift)
         place = (stands[..., None] * part).sum(axis=0) / stands.sum(axis=0)[:, None]
         goal[span, foot, :, :2], goal[span, foot, :, 2] = place[:, :2], support.height
         weight[span, foot] = settings.stands * stands
     positions, quats = motion.forward_kinematics()
     bodies = positions.shape[1]
-    joints = np.repeat(np.array([humanoid.feet[k] for k in order]), 2)
-    offsets = np.concatenate([humanoid.sole_points[k] for k in order])
-    body_weight = settings.body * np.sqrt(trust)[:, None] * np.ones(bodies)
-    targets = Targets(
-        point_joint=np.concatenate([joints, np.arange(bodies)]),
-        point_offset=np.concatenate([offsets, np.zeros((bodies, 3))]),
-        positions=np.concatenate([goal.reshape(len(motion), -1, 3), positions], axis=1),
-        position_weight=np.concatenate([weight.reshape(len(motion), -1), body_weight], axis=1),
-        frame_joint=np.array([0]),
-        orientations=quats[:, :1],
-        orientation_weight=np.array([settings.turn]),
-    )
-    qpos = solve_smooth(
-        motion.skeleton,
-        motion.qpos,
-        targets,
-        motion.fps,
-        Smoothness(settings.hinges, settings.root),
-        limits=humanoid.joint_range,
-        iterations=settings.iterations,
-    )
+    ground = _ground(len(motion), supports)[..., None]
+    qpos = motion.qpos
+    for _ in range(settings.rounds):
+        targets = Targets(
+            point_joint=np.concatenate([joints, np.arange(bodies)]),
+            point_offset=np.concatenate([offsets, np.zeros((bodies, 3))]),
+            positions=np.concatenate([goal.reshape(len(motion), -1, 3), positions], axis=1),
+            position_weight=np.concatenate(
+                [
+                    weight.reshape(len(motion), -1),
+                    settings.body * np.sqrt(trust)[:, None] * np.ones(bodies),
+                ],
+                axis=1,
+            ),
+            frame_joint=np.array([0]),
+            orientations=quats[:, :1],
+            orientation_weight=np.array([settings.turn]),
+        )
+        qpos = solve_smooth(
+            motion.skeleton,
+            qpos,
+            targets,
+            motion.fps,
+            Smoothness(settings.hinges, settings.root),
+            limits=humanoid.joint_range,
+            iterations=settings.iterations,
+        )
+        # A point of the sole that has sunk is held where it is, at the ground's height.
+        found = _soles(humanoid, replace(motion, qpos=qpos))[0]
+        sunk = (found[..., 2] < ground - _DEEP) | (weight == settings.clear)
+        new = sunk & (weight < settings.clear)
+        goal = np.where(new[..., None], np.stack([*np.moveaxis(found[..., :2], -1, 0), ground + 0 * weight], -1), goal)
+        weight = np.where(new, settings.clear, weight)
+    qpos = qpos.copy()
     qpos[:, 3:7] = rot.continuous(qpos[:, 3:7])
     return replace(motion, qpos=qpos)
+
+
+def _soles(humanoid: HumanoidModel, motion: Motion) -> tuple[Array, NDArray[np.intp], Array]:
+    """Corners ``[T, 2, 4, 3]`` m of the right and the left sole, two of the heel first.
+
+    Also the joint ``[8]`` and the place ``[8, 3]`` m in its frame of each.
+    """
+    joints, offsets = sole_corners(humanoid)
+    names = [humanoid.skeleton.names[foot] for foot in humanoid.feet]
+    order = [names.index(name) for name in ("RightFoot", "LeftFoot")]
+    corners = sole_edges(humanoid, motion).reshape(len(motion), len(names), 4, 3)[:, order]
+    return corners, joints.reshape(-1, 4)[order].ravel(), offsets.reshape(-1, 4, 3)[order].reshape(-1, 3)
+
+
+def _ground(frames: int, supports: Sequence[Support]) -> Array:
+    """``[T, 2]`` m: what the right and the left foot are above: the lower of what it stood on and will stand on.
+
+    A foot that never stands may be anywhere.
+    """
+    ground = np.full((frames, 2), -np.inf)
+    for foot in (0, 1):
+        own = sorted((s for s in supports if s.foot == foot), key=lambda s: s.start)
+        edges = [0, *[s.start for s in own[1:]], frames]
+        for k, support in enumerate(own):
+            ground[edges[k] : edges[k + 1], foot] = support.height
+            if k + 1 < len(own):
+                ground[support.stop : own[k + 1].start, foot] = min(support.height, own[k + 1].height)
+    return ground
