@@ -41,7 +41,7 @@ from egopose.evaluation.scene_page import write_scene_page
 from egopose.humanoid.model import HumanoidModel
 from egopose.inference.reconstruction import PLAN
 from egopose.inference.scene_preparation import prepare_scene
-from egopose.inference.scene_recovery import SEARCH, recover_scene
+from egopose.inference.scene_recovery import REFINEMENT, SEARCH, recover_scene
 from egopose.motion.motion import Motion
 from egopose.scene.camera_file import save_camera
 from egopose.scene.clip import Clip, read_clip
@@ -178,8 +178,9 @@ def judged(humanoid: HumanoidModel, clip: TrueClip, folder: Path, acted: Sequenc
         if path.is_file():
             simulated = _simulated(path, found, humanoid)
             row = {"motion": motion, **scene_figures(humanoid, simulated, true, turn)}
-            card = path.with_name(SEARCH)
-            rows.append({**row, "seconds": read_json(card, "search")["seconds"]} if card.is_file() else row)
+            cards = [card for card in (path.with_name(SEARCH), path.with_name(REFINEMENT)) if card.is_file()]
+            seconds = sum(float(read_json(card, card.stem)["seconds"]) for card in cards)
+            rows.append({**row, "seconds": seconds} if cards else row)
     return rows
 
 

@@ -22,23 +22,27 @@ from egopose.inference.progress import StageProgress
 from egopose.inference.reconstruction import FITTED, PAGE, PLAN
 from egopose.inference.sampled_motion import Found, SamplingSettings
 from egopose.inference.scene_motion import recovered
+from egopose.inference.scene_refinement import Refined, refined
+from egopose.inference.window_refinement import RefinementSettings
 from egopose.pipeline.agent import load_policy
 from egopose.scene.clip import read_clip
 from egopose.scene.scene_file import FREE, Box, Scene, write_scene
-from egopose.scene.simulated import as_simulated
+from egopose.scene.simulated import as_simulated, load_simulated
 
 SEARCH = "search.json"
+REFINEMENT = "refinement.json"
+_SAMPLED = "sampled.npz"
 #: What a frame costs in each stage, ms: measured on two cores beside other work.
-_COSTS = {"physics": 400.0, "report": 60.0}
+_COSTS = {"physics": 400.0, "refinement": 2000.0, "report": 60.0}
 #: Changes with what the stages compute from the same inputs.
-_VERSION = 1
+_VERSION = 2
 
 
 def recover_scene(values: Mapping[str, Any], folder: Path, write_report: Callable[[Path, Path], object]) -> Path:
     """Find the simulated motion of a prepared ``folder`` and report it; returns the folder.
 
-    Leaves ``plan.npz`` (:class:`~egopose.scene.simulated.SimulatedMotion`), ``scene.fitted.yaml``, ``search.json`` and
-    ``reconstruction.html``.
+    Leaves ``sampled.npz`` and ``plan.npz`` (:class:`~egopose.scene.simulated.SimulatedMotion`, before and after
+    refinement), ``scene.fitted.yaml``, ``search.json``, ``refinement.json`` and ``reconstruction.html``.
 
     Args:
         values: ``conf/reconstruct.yaml``, resolved.
@@ -49,6 +53,7 @@ def recover_scene(values: Mapping[str, Any], folder: Path, write_report: Callabl
         InputError: a setting, the policy or a file of the preparation cannot be used. Stages that were made stay.
     """
     settings = SamplingSettings.from_config(values["sampling"])
+    refinement = RefinementSettings.from_config(values["refinement"])
     chosen = FOLDER / "tracker" if values["policy"] is None else Path(str(values["policy"]))
     policy = load_policy(chosen)
     free = convert(values["fit"], bool, "conf/reconstruct.yaml", "fit")
@@ -70,6 +75,15 @@ def recover_scene(values: Mapping[str, Any], folder: Path, write_report: Callabl
                 found = recovered(folder, clip, humanoid, policy, settings, free, share)
                 seconds = time.perf_counter() - began
                 store.make("physics", inputs, lambda part: _keep(found, clip.scene, seconds, part))
+        closer = inputs | {"sampled": store.digest(_SAMPLED), "refinement": values["refinement"]}
+        if not store.done("refinement", closer):
+            with progress.stage("refinement") as advance:
+                began = time.perf_counter()
+                sampled = load_simulated(folder / _SAMPLED)
+                share = _Share(refinement.sweeps + 1, advance)
+                better = refined(folder, clip, humanoid, policy, refinement, sampled, share)
+                seconds = time.perf_counter() - began
+                store.make("refinement", closer, lambda part: _keep_refined(better, seconds, part))
         told = {PLAN: store.digest(PLAN), FITTED: store.digest(FITTED), "version": _VERSION}
         if not store.done("report", told):
             with progress.stage("report"):
@@ -98,7 +112,7 @@ def _digest(checkpoint: Path) -> str:
 
 
 def _keep(found: Found, scene: Scene, seconds: float, out: Path) -> None:
-    found.motion.save(out / PLAN)
+    found.motion.save(out / _SAMPLED)
     write_scene(fitted(scene, found), out / FITTED)
     spread = found.changes.std(axis=0)
     told = {
@@ -115,6 +129,12 @@ def _keep(found: Found, scene: Scene, seconds: float, out: Path) -> None:
         },
     }
     (out / SEARCH).write_text(json.dumps(told, indent=1))
+
+
+def _keep_refined(better: Refined, seconds: float, out: Path) -> None:
+    better.motion.save(out / PLAN)
+    told = {"cost_before": better.before, "cost": better.after, "seconds": seconds}
+    (out / REFINEMENT).write_text(json.dumps(told, indent=1))
 
 
 def fitted(scene: Scene, found: Found) -> Scene:
