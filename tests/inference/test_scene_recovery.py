@@ -18,7 +18,10 @@ from egopose.inference.scene_recovery import FITTED, PAGE, PLAN, SEARCH, recover
 from egopose.scene.scene_file import read_scene
 from egopose.scene.simulated import load_simulated
 
-SMALL = ("sampling.samples=16", "sampling.kept=4", "sampling.passes=2", "sampling.threads=1")
+SMALL = (
+    *("sampling.samples=16", "sampling.kept=4", "sampling.passes=2", "sampling.threads=1"),
+    *("refinement.sweeps=1", "refinement.window=6", "refinement.knots=6", "refinement.advance=6", "refinement.iterations=1"),
+)
 
 
 def settings(folder: Path, *more: str) -> dict[str, Any]:

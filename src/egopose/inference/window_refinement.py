@@ -65,6 +65,7 @@ class RefinementSettings:
     Args:
         window: frames ahead.
         knots: frames between two knots.
+        changed: frames of a window in which offsets have knots; the rest shows what comes of them.
         advance: frames that a body takes before the next window.
         iterations: of Gauss-Newton in a window.
         sweeps: over the clip; 0 leaves the motion as it was found.
@@ -77,6 +78,7 @@ class RefinementSettings:
 
     window: int
     knots: int
+    changed: int
     advance: int
     iterations: int
     sweeps: int
@@ -87,11 +89,12 @@ class RefinementSettings:
     weights: RefinementWeights
 
     def __post_init__(self) -> None:
-        for name in ("window", "knots", "advance", "iterations", "threads"):
+        for name in ("window", "knots", "changed", "advance", "iterations", "threads"):
             if getattr(self, name) < 1:
                 raise InputError("refinement", name, "must be at least 1")
-        if self.advance > self.window:
-            raise InputError("refinement", "advance", f"{self.advance} frames are more than the window, {self.window}")
+        for name, most in (("changed", "window"), ("advance", "changed")):
+            if getattr(self, name) > getattr(self, most):
+                raise InputError("refinement", name, f"{getattr(self, name)} frames are more than {most}")
         if self.sweeps < 0:
             raise InputError("refinement", "sweeps", "must not be negative")
         for name in ("difference", "reach"):
@@ -154,7 +157,7 @@ class WindowRefiner:
     ) -> None:
         self._humanoid, self._tracker, self._reference, self.settings = humanoid, tracker, reference, settings
         self._nu = humanoid.mj_model.nu
-        knots = -(-settings.window // settings.knots)
+        knots = -(-settings.changed // settings.knots)
         count = max(1 + knots * self._nu, 1 + len(settings.dampings))
         self._physics = BatchedPhysics(
             humanoid.mj_model, count, humanoid.substeps, settings.threads, body_ids=humanoid.body_ids
@@ -241,7 +244,7 @@ class WindowRefiner:
     ) -> tuple[_Futures, Array]:
         """The best future of a window, and its offsets ``[L, nu]``."""
         settings = self.settings
-        shape = _lines(len(offsets), settings.knots)
+        shape = _lines(len(offsets), settings.knots)[: -(-settings.changed // settings.knots)]
         alone = settings.difference * np.einsum("kl,ij->kilj", shape, np.eye(self._nu)).reshape(-1, *offsets.shape)
         alone = np.concatenate([np.zeros((1, *offsets.shape)), alone])
         best = None
