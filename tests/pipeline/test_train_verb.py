@@ -176,7 +176,7 @@ def test_what_a_run_keeps_cannot_be_changed_in_its_file(finished: Path, launcher
 def test_an_unknown_run_is_refused_and_not_made(launcher: Path, tmp_path: Path) -> None:
     code, _, err = command(launcher, tmp_path, "resume=nowhere")
     assert code == 2
-    assert err.strip() == "error: nowhere: run directory: does not exist"
+    assert err.strip() == "error: nowhere: resume: no such folder"
     assert not (tmp_path / "nowhere").exists()
 
 

@@ -27,6 +27,7 @@ from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 from egopose.core.config_files import config_dir, setting_names
 from egopose.core.errors import InputError
 from egopose.core.former_names import RENAMED
+from egopose.core.path_settings import check_paths, check_run_directory
 from egopose.core.safe_io import check_config_folder
 
 T = TypeVar("T")
@@ -188,15 +189,25 @@ def faults_told(name: str) -> Iterator[None]:
 
 
 def command(name: str) -> Callable[[Callable[[DictConfig], None]], Callable[[], None]]:
-    """``hydra.main`` on ``conf/NAME.yaml`` behind :func:`check_arguments`; what was given wrong ends in one line."""
+    """``hydra.main`` on ``conf/NAME.yaml`` behind :func:`check_arguments` and
+    :func:`~egopose.core.path_settings.check_paths`; what was given wrong ends in one line.
+    """
 
     def decorate(function: Callable[[DictConfig], None]) -> Callable[[], None]:
-        entry = hydra.main(version_base="1.3", config_path=str(config_dir()), config_name=name)(function)
+        @wraps(function)
+        def checked(config: DictConfig) -> None:
+            # Within Hydra's call: an exception that leaves it has a line of Hydra's before it.
+            with faults_told(name):
+                check_paths(name, config)
+                function(config)
+
+        entry = hydra.main(version_base="1.3", config_path=str(config_dir()), config_name=name)(checked)
 
         @wraps(function)
         def main() -> None:
             with faults_told(name):
                 check_arguments(sys.argv[1:])
+                check_run_directory(sys.argv[1:])
                 entry()
 
         return main
