@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import MISSING, fields
 from datetime import datetime
-from functools import wraps
+from functools import lru_cache, wraps
 from pathlib import Path
 from typing import Any, TypeVar, Union
 
@@ -118,14 +118,21 @@ def compose_config(name: str, overrides: Sequence[str] = ()) -> dict[str, Any]:
         InputError: an override names no setting or choice, or a value is missing.
     """
     register_resolvers()
+    try:
+        return resolved(_composed(name, tuple(overrides)))
+    except HydraException as error:
+        raise explained(name, error) from None
+
+
+@lru_cache(maxsize=128)
+def _composed(name: str, overrides: tuple[str, ...]) -> DictConfig:
+    """Not resolved, and not to be changed. Hydra takes 0.2 s for it, and commands ask for the same again."""
     # Hydra's main has initialised its one instance, and a second one is refused.
     running = GlobalHydra.instance().hydra
     GlobalHydra.instance().clear()
     try:
         with initialize_config_dir(str(config_dir()), version_base="1.3"):
-            return resolved(compose(name, list(overrides)))
-    except HydraException as error:
-        raise explained(name, error) from None
+            return compose(name, list(overrides))
     finally:
         GlobalHydra.instance().hydra = running
 
