@@ -103,7 +103,8 @@ class FreeBoxes:
 
     def placed(self, change: Array) -> tuple[Array, Array]:
         """Tops ``[n, K, 3]`` and headings ``[n, K]`` of boxes changed by ``change [n, K, 4]``."""
-        tops, headings = moved_boxes(*(torch.from_numpy(part) for part in (self.tops, self.headings, change)))
+        guess = torch.from_numpy(self.tops), torch.from_numpy(self.headings)
+        tops, headings = moved_boxes(*guess, torch.from_numpy(change))
         return tops.numpy(), headings.numpy()
 
     def drawn(self, rng: np.random.Generator, count: int) -> Array:
