@@ -3,11 +3,17 @@
 from __future__ import annotations
 
 import os
+import sys
 from pathlib import Path
 
 import pytest
+from absl import logging as absl_logging
 
 from egopose.core.torch_settings import enable_onednn_matmul
+
+# absl writes to what is `sys.stderr` at its import, here a buffer of pytest's, and closes it when a library configures
+# logging: Hydra looks at its plugins, and submitit's does. It never closes `sys.__stderr__`.
+absl_logging.get_absl_handler().python_handler.stream = sys.__stderr__
 
 SHARED = Path(__file__).resolve().parents[1].parent / "shared"
 

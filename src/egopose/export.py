@@ -14,6 +14,7 @@ from pathlib import Path
 
 from egopose.core.config import check_arguments, compose_config
 from egopose.core.errors import InputError
+from egopose.core.path_settings import Kind, checked_path
 
 
 def main() -> None:
@@ -22,8 +23,6 @@ def main() -> None:
     if not words or any(word in ("-h", "--help") for word in words):
         print(__doc__)
         raise SystemExit(0 if words else 2)
-    from egopose.inference.export import run_export
-
     sources = [word for word in words if "=" not in word]
     files = [word.removeprefix("to=") for word in words if word.startswith("to=")]
     overrides = [word for word in words if "=" in word and not word.startswith("to=")]
@@ -33,7 +32,12 @@ def main() -> None:
         check_arguments(words)
         if len(sources) != 1:
             raise InputError("export", "source", f"takes one motion or evaluation, not {len(sources)}: {sources}")
-        for path in run_export(Path(sources[0]), files, compose_config("export", overrides)):
+        source = checked_path(sources[0], Kind.EXISTING, "source")
+        files = [checked_path(file, Kind.NEW_FILE, "to") for file in files]
+
+        from egopose.inference.export import run_export
+
+        for path in run_export(Path(source), files, compose_config("export", overrides)):
             print(path)
     except InputError as error:
         print(f"error: {error}", file=sys.stderr)

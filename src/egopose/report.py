@@ -11,6 +11,7 @@ from pathlib import Path
 
 from egopose.core.config import check_arguments
 from egopose.core.errors import InputError
+from egopose.core.path_settings import Kind, checked_path
 
 
 def main() -> None:
@@ -19,14 +20,16 @@ def main() -> None:
     if not words or any(word in ("-h", "--help") for word in words):
         print(__doc__)
         raise SystemExit(0 if words else 2)
-    from egopose.evaluation.reports import run_report
-
     folders = [word for word in words if "=" not in word]
     try:
         check_arguments(words)
         if len(folders) != 1:
             raise InputError("report", "folder", f"takes one folder, not {len(folders)}: {folders}")
-        print(run_report(Path(folders[0]), [word for word in words if "=" in word]))
+        folder = checked_path(folders[0], Kind.FOLDER, "folder")
+
+        from egopose.evaluation.reports import run_report
+
+        print(run_report(Path(folder), [word for word in words if "=" in word]))
     except InputError as error:
         print(f"error: {error}", file=sys.stderr)
         raise SystemExit(2) from None

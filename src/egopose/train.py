@@ -20,6 +20,7 @@ from omegaconf import DictConfig
 from egopose.core.config import check_arguments, faults_told, register_resolvers, resolved
 from egopose.core.config_files import config_dir
 from egopose.core.errors import InputError
+from egopose.core.path_settings import check_paths, check_run_directory
 
 register_resolvers()
 
@@ -27,6 +28,11 @@ register_resolvers()
 @hydra.main(version_base="1.3", config_path=str(config_dir()), config_name="train")
 def hydra_main(config: DictConfig) -> float:
     """One job of Hydra's: a new run, one resumed, or one of a sweep."""
+    state = HydraConfig.get()
+    # Not after the imports, which take seconds.
+    with faults_told("train"):
+        check_paths(str(state.job.config_name), config)
+
     from egopose.pipeline.body_parts import train_body_parts
     from egopose.pipeline.contacts import train_contacts
     from egopose.pipeline.head_signal import train_head_signal
@@ -34,7 +40,6 @@ def hydra_main(config: DictConfig) -> float:
     from egopose.pipeline.tracker import train_tracker
     from egopose.pipeline.training import STOPPING, start_run
 
-    state = HydraConfig.get()
     # MuJoCo warns here of every world that diverges; they are counted, and their last states kept.
     logging.getLogger("absl").setLevel(logging.ERROR)
     try:
@@ -57,18 +62,8 @@ def main() -> None:
     """The command. A run directory that is not there is refused before Hydra would make it."""
     with faults_told("train"):
         check_arguments(sys.argv[1:])
-        for word in sys.argv[1:]:
-            name, _, value = word.partition("=")
-            if name == "resume" and value not in ("", "null"):
-                _check_run_directory(Path(value))
+        check_run_directory(sys.argv[1:])
         hydra_main()
-
-
-def _check_run_directory(folder: Path) -> None:
-    if not folder.is_dir():
-        raise InputError(folder, "run directory", "does not exist")
-    if not (folder / "config.yaml").is_file() and not (folder / "checkpoints").is_dir():
-        raise InputError(folder, "config.yaml", "is missing: this is no run directory")
 
 
 if __name__ == "__main__":

@@ -56,7 +56,7 @@ def test_a_slip_in_a_setting_is_told_with_what_there_is(override: str, said: str
     ("words", "said"),
     [
         (["train", "training.max_second=3"], "did you mean training.max_seconds?"),
-        (["sync", "video=walk.mp4"], "motion: is missing; give motion=..."),
+        (["package", "name=mine"], "run: is missing; give run=..."),
     ],
 )
 def test_the_command_tells_it_in_one_line(words: list[str], said: str) -> None:

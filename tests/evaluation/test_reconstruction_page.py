@@ -150,6 +150,8 @@ def test_the_page_is_whole_and_tells_the_truth(folder: Path, good: Findings, tmp
     assert page.count("<svg") == 3
     assert "Nowhere that is looked for" in page
     assert "0.77" in page
+    assert "<p>Motion: <code>plan.npz</code></p>" in page
+    assert str(folder.parent) not in page
     assert not re.search(r'(src|href)="(?!data:)', page)
     data: dict[str, Any] = json.loads(re.search(r'id="data">(.*?)</script>', page, re.DOTALL).group(1))  # type: ignore[union-attr]
     said = {row["what"]: row["value"] for row in data["numbers"]}

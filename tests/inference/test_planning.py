@@ -609,8 +609,10 @@ def path_reward(weight: float) -> dict[str, Any]:
     return {**table, "terms": {**table["terms"], **ours}}
 
 
-def planner_on(path: Tensor | None, reward: dict[str, Any], seed: int = 0, place_time: float = np.inf) -> Planner:
-    changes = {"samples": 32, "horizon": 12, "every": 6, "deviation": 0.4, "acceleration": 0.0, "margin": 0.0}
+def planner_on(
+    path: Tensor | None, reward: dict[str, Any], seed: int = 0, place_time: float = np.inf, **changed: Any
+) -> Planner:
+    changes = {"samples": 32, "horizon": 12, "every": 6, "deviation": 0.4, "acceleration": 0.0, "margin": 0.0} | changed
     chosen = settings(**{**SMALL, **changes, "place_time": place_time, "reward": reward, "seed": seed})
     copies, states = frozen(make_env(2 * chosen.samples)), states_of(true_motion()[0])
     return Planner(copies, passive(), critic(), chosen, Followed(states, global_frame, path))
@@ -681,7 +683,8 @@ def test_the_path_is_chosen_by_and_no_part_of_the_value() -> None:
 
 def test_a_planned_body_restarts_on_the_planners_path_as_it_lies_by_then() -> None:
     path, states = along(x=2.0, turn=0.5), states_of(true_motion()[0])
-    planner = planner_on(path, path_reward(1.0), place_time=0.5)
+    # A body that is put on its path at every frame is planned for at every frame; what the plan is does not matter.
+    planner = planner_on(path, path_reward(1.0), place_time=0.5, samples=4, horizon=6)
     guard = FailSafe(2, FailSafeSettings("naive", 0.6, fallen_height=9.0, restart="path"))  # at every frame
     env = make_env(2)
     restart = restart_path("path", env, planner)

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from helpers.clip_folder import clip_folder
 
 from egopose.checkpoint.pretrained import FOLDER
@@ -14,6 +15,7 @@ from egopose.core.config import compose_config
 from egopose.core.errors import InputError
 from egopose.data.preparation import humanoid_of
 from egopose.data.reference import reference_states
+from egopose.envs.scene_ranges import SceneRanges
 from egopose.humanoid.model import HumanoidModel
 from egopose.humanoid.physics import BatchedPhysics
 from egopose.inference.motion_cost import TERMS, CostWeights, MotionCost
@@ -184,3 +186,18 @@ def test_a_policy_that_follows_nothing_is_refused(tmp_path: Path, humanoid: Huma
     blind = replace(policy, config={**policy.config, "task": {}})
     with pytest.raises(InputError, match="ahead"):
         recovered(tmp_path, walk(tmp_path), humanoid, blind, settings(), False)
+
+
+def test_boxes_of_the_worlds_move_as_those_of_a_scene_that_is_fitted() -> None:
+    """Along the heading by x, across it by y; no face sinks into the floor."""
+    tops, headings = np.array([[1.0, 2.0, 0.3], [0.0, 0.0, 0.1]]), np.array([np.pi / 2, 0.4])
+    change = np.random.default_rng(0).uniform(-0.4, 0.4, (5, 2, 4))
+    nothing = np.zeros((2, 4))
+    boxes = FreeBoxes(tops, headings, np.ones((2, 2)), nothing, nothing, nothing, np.zeros(4), np.zeros(2, int))
+    ranges = SceneRanges(*map(torch.from_numpy, (tops, headings, nothing, nothing)), 10.0)
+    placed = boxes.placed(change)
+    for one, other in zip(placed, ranges.changed(torch.from_numpy(change)), strict=True):
+        np.testing.assert_array_equal(one, other.numpy())
+    np.testing.assert_allclose(placed[0][:, 0, 0], 1.0 - change[:, 0, 1])
+    np.testing.assert_allclose(placed[0][:, 0, 1], 2.0 + change[:, 0, 0])
+    assert placed[0][..., 2].min() == 0.0

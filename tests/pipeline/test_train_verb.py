@@ -11,6 +11,7 @@ from typing import Any
 
 import pytest
 from helpers.train_command import (
+    called,
     command,
     launcher,
     start,
@@ -146,37 +147,36 @@ def test_a_run_directory_holds_what_was_run(finished: Path) -> None:
     assert verify(find_checkpoint(finished))["iteration"] == 3
 
 
-def test_resumed_by_command_with_more_iterations(finished: Path, launcher: Path, tmp_path: Path) -> None:
+def test_resumed_by_command_with_more_iterations(finished: Path, tmp_path: Path) -> None:
     folder = Path(shutil.copytree(finished, tmp_path / "run"))
-    code, out, err = command(launcher, tmp_path, f"resume={folder}", "algo.iterations=5")
+    code, out, err = called(tmp_path, f"resume={folder}", "algo.iterations=5")
     assert code == 0, err
     assert "after iteration 3" in out
     assert len((folder / "curves.csv").read_text().splitlines()) == 6
     assert read_json(find_checkpoint(folder), "config")["algo"]["iterations"] == 5
 
 
-def test_what_a_run_keeps_cannot_be_changed(finished: Path, launcher: Path, tmp_path: Path) -> None:
+def test_what_a_run_keeps_cannot_be_changed(finished: Path, tmp_path: Path) -> None:
     folder = Path(shutil.copytree(finished, tmp_path / "run"))
-    code, _, err = command(launcher, tmp_path, f"resume={folder}", "algo.gamma=0.9")
+    code, _, err = called(tmp_path, f"resume={folder}", "algo.gamma=0.9")
     assert code == 2
     assert "algo.gamma" in err
-    assert "Traceback" not in err
+    assert len(err.splitlines()) == 1
 
 
-@pytest.mark.slow
-def test_what_a_run_keeps_cannot_be_changed_in_its_file(finished: Path, launcher: Path, tmp_path: Path) -> None:
+def test_what_a_run_keeps_cannot_be_changed_in_its_file(finished: Path, tmp_path: Path) -> None:
     folder = Path(shutil.copytree(finished, tmp_path / "run"))
     config = OmegaConf.load(folder / "config.yaml")
     config.algo.gamma = 0.5
     OmegaConf.save(config, folder / "config.yaml")
-    code, _, err = command(launcher, tmp_path, f"resume={folder}")
+    code, _, err = called(tmp_path, f"resume={folder}")
     assert (code, "algo.gamma" in err) == (2, True)
 
 
-def test_an_unknown_run_is_refused_and_not_made(launcher: Path, tmp_path: Path) -> None:
-    code, _, err = command(launcher, tmp_path, "resume=nowhere")
+def test_an_unknown_run_is_refused_and_not_made(tmp_path: Path) -> None:
+    code, _, err = called(tmp_path, "resume=nowhere")
     assert code == 2
-    assert err.strip() == "error: nowhere: run directory: does not exist"
+    assert err.strip() == "error: nowhere: resume: no such folder"
     assert not (tmp_path / "nowhere").exists()
 
 
@@ -199,8 +199,8 @@ def test_signals_save_and_tell_how_to_go_on(number: int, launcher: Path, tmp_pat
 
 
 @pytest.mark.slow
-def test_multirun(launcher: Path, tmp_path: Path) -> None:
-    code, _, err = command(launcher, tmp_path, "--multirun", "algo.iterations=1", "logger=csv", "seed=0,1")
+def test_multirun(tmp_path: Path) -> None:
+    code, _, err = called(tmp_path, "--multirun", "algo.iterations=1", "logger=csv", "seed=0,1")
     assert code == 0, err
     (sweep,) = (tmp_path / "runs" / "sweeps").iterdir()
     seeds = [read_json(find_checkpoint(sweep / job), "config")["seed"] for job in ("0", "1")]

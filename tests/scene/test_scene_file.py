@@ -20,6 +20,7 @@ from egopose.scene.scene_file import (
     Contact,
     Scene,
     read_scene,
+    read_told_scene,
     write_scene,
 )
 
@@ -119,3 +120,10 @@ def test_a_fault_is_told_by_its_field(tmp_path: Path, text: str, place: str) -> 
 def test_a_missing_file_is_told(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="is missing"):
         read_scene(tmp_path / "nothing.yaml")
+
+
+@pytest.mark.parametrize(("text", "told"), [("boxes: []", True), ("fps: 30", False), ("boxes:", False)])
+def test_no_boxes_is_told_apart_from_nothing_said_of_boxes(text: str, told: bool, tmp_path: Path) -> None:
+    (tmp_path / "scene.yaml").write_text(text)
+    scene, tells = read_told_scene(tmp_path / "scene.yaml")
+    assert (scene.boxes, tells) == ((), told)

@@ -13,7 +13,7 @@ VERBS = {
     "export": "write motions for other programs: BVH, GLB, AMASS npz, TRC, C3D, OpenSim, CSV",
     "view": "show motions, estimates, forecasts and reconstructions in the browser",
     "package": "make a small folder of a trained run to give away: no optimisers, no local paths",
-    "reconstruct": "prepare a third person's film: poses, camera, contacts, root and a scene of boxes",
+    "reconstruct": "act out a third person's film in physics, among fitted boxes; `prepare` ends before physics",
     "report": "make one HTML page of an evaluation, a sweep or a reconstruction: tables, curves, pictures",
     "stream": "estimate motion live from a camera, a video or an address: WebSocket, file, latencies",
     "bench": "measure the speed of the environment and of the pipeline",

@@ -50,11 +50,7 @@ class SceneRanges:
 
     def changed(self, change: Tensor) -> tuple[Tensor, Tensor]:
         """Upper faces ``[..., K, 3]`` m and headings ``[..., K]`` rad of boxes changed by ``change [..., K, 4]``."""
-        cos, sin = self.headings.cos(), self.headings.sin()
-        along, across, up, turn = change.unbind(-1)
-        x, y = self.tops[:, 0] + cos * along - sin * across, self.tops[:, 1] + sin * along + cos * across
-        height = (self.tops[:, 2] + up).clamp(_LOWEST, self.highest)
-        return torch.stack([x, y, height], dim=-1), self.headings + turn
+        return moved_boxes(self.tops, self.headings, change, self.highest)
 
     def change(self, tops: Tensor, headings: Tensor) -> Tensor:
         """The change ``[..., K, 4]`` that leads to boxes there: the opposite of :meth:`changed`."""
@@ -86,6 +82,23 @@ class SceneRanges:
         """The boxes of n worlds, changed by ``change [n, K, 4]``."""
         tops, headings = self.changed(change)
         return Scene(tops, headings, torch.ones(headings.shape, dtype=torch.bool))
+
+
+def moved_boxes(tops: Tensor, headings: Tensor, change: Tensor, highest: float = float("inf")) -> tuple[Tensor, Tensor]:
+    """Upper faces and headings of boxes that are changed; no face is under the floor.
+
+    Args:
+        tops: ``[K, 3]`` m. headings: ``[K]`` rad.
+        change: ``[..., K, 4]`` along and across the heading and in height (m), in heading (rad).
+        highest: m, of an upper face.
+
+    Returns:
+        ``[..., K, 3]`` m and ``[..., K]`` rad.
+    """
+    cos, sin = headings.cos(), headings.sin()
+    along, across, up, turn = change.unbind(-1)
+    x, y = tops[:, 0] + (cos * along - sin * across), tops[:, 1] + (sin * along + cos * across)
+    return torch.stack([x, y, (tops[:, 2] + up).clamp(_LOWEST, highest)], dim=-1), headings + turn
 
 
 def moved_with(

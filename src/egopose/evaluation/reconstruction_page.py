@@ -63,7 +63,7 @@ def write_reconstruction_page(found: Reconstruction, settings: ReconstructionPag
     values = {
         "title": f"{found.folder.resolve().name}: the reconstruction",
         "data": {"numbers": [_plain(row) for row in found.numbers.rows()], "failures": failures},
-        "motion": found.path,
+        "motion": found.path.name,
         "begin": found.scene.begin,
         "fps": found.motion.fps,
         "failures": failures[: settings.sentences],

@@ -13,6 +13,7 @@ from typing import Any
 
 from egopose.core.config import compose_config, from_mapping
 from egopose.core.errors import InputError
+from egopose.core.path_settings import Kind, checked_path
 from egopose.core.safe_io import read_json
 from egopose.evaluation.estimation_page import ReportSettings, write_report
 from egopose.evaluation.forecast_page import write_forecast_page
@@ -58,7 +59,8 @@ def rollout_report(
 
 
 def _simulated(config: Mapping[str, Any]) -> Path | None:
-    return None if config["simulated"] is None else Path(str(config["simulated"])).expanduser()
+    given = config["simulated"]
+    return None if given is None else Path(checked_path(given, Kind.FILE, "simulated"))
 
 
 def run_report(folder: Path, overrides: Sequence[str] = ()) -> Path:
@@ -89,7 +91,7 @@ def run_report(folder: Path, overrides: Sequence[str] = ()) -> Path:
 
 
 def _out(config: Mapping[str, Any], folder: Path, name: str = "report.html") -> Path:
-    out = folder / name if config["out"] is None else Path(str(config["out"]))
+    out = folder / name if config["out"] is None else Path(checked_path(config["out"], Kind.NEW_FILE, "out"))
     if not out.parent.is_dir():
         raise InputError(out, "out", f"no folder {out.parent}")
     return out

@@ -16,6 +16,7 @@ from typing import Any
 from egopose.checkpoint.checkpoint import read_json as read_part
 from egopose.core.config import compose_config, from_mapping
 from egopose.core.errors import InputError
+from egopose.core.path_settings import Kind, checked_path
 from egopose.core.safe_io import read_json
 from egopose.data.preparation import humanoid_of
 from egopose.humanoid.inverse_dynamics import ForceSettings, with_forces
@@ -92,7 +93,8 @@ def run_export(source: Path, files: Sequence[str], config: Mapping[str, Any]) ->
 
 def _reconstruction(source: Path, config: Mapping[str, Any]) -> Reconstruction | None:
     """None where the source is none."""
-    simulated = None if config["simulated"] is None else Path(str(config["simulated"])).expanduser()
+    given = config["simulated"]
+    simulated = None if given is None else Path(checked_path(given, Kind.FILE, "simulated"))
     folder = reconstruction_folder(source, simulated)
     if folder is None:
         if simulated is not None:

@@ -16,10 +16,12 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from egopose.core.config import from_mapping
 from egopose.core.errors import InputError
+from egopose.envs.scene_ranges import moved_boxes
 from egopose.humanoid.model import HumanoidModel
 from egopose.humanoid.physics import BatchedPhysics
 from egopose.inference.motion_cost import CostWeights, MotionCost
@@ -101,11 +103,9 @@ class FreeBoxes:
 
     def placed(self, change: Array) -> tuple[Array, Array]:
         """Tops ``[n, K, 3]`` and headings ``[n, K]`` of boxes changed by ``change [n, K, 4]``."""
-        cos, sin = np.cos(self.headings), np.sin(self.headings)
-        moved = np.stack([cos, sin], -1) * change[..., :1] + np.stack([-sin, cos], -1) * change[..., 1:2]
-        tops = self.tops + np.concatenate([moved, change[..., 2:3]], axis=-1)
-        tops[..., 2] = np.maximum(tops[..., 2], 0.0)
-        return tops, self.headings + change[..., 3]
+        guess = torch.from_numpy(self.tops), torch.from_numpy(self.headings)
+        tops, headings = moved_boxes(*guess, torch.from_numpy(change))
+        return tops.numpy(), headings.numpy()
 
     def drawn(self, rng: np.random.Generator, count: int) -> Array:
         """``[count, K, 4]`` changes about those that suit the reference, within their ranges."""

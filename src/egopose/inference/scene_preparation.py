@@ -21,14 +21,14 @@ from egopose.data.preparation import humanoid_of
 from egopose.inference import scene_stages as stages
 from egopose.inference.progress import StageProgress
 from egopose.inference.scene_stages import Advance, Sources
-from egopose.scene.scene_file import Scene, read_scene, tells_boxes
+from egopose.scene.scene_file import Scene, read_told_scene
 from egopose.vision.video import probe_video
 
 #: What a frame costs in each stage, ms: measured on two cores on a film of 1000 x 800 px.
 COSTS = {"poses": 250.0, "camera": 40.0, "sides": 2.0, "contacts": 1.0, "joints": 1.0, "motion": 20.0, "root": 3.0}
 COSTS |= {"scene": 1.0, "page": 30.0}
 #: Changes with what the stages compute from the same inputs.
-_VERSION = 7
+_VERSION = 8
 _SCENE = "scene.yaml"
 
 
@@ -50,7 +50,7 @@ def prepare_scene(
     except OSError as error:
         raise InputError(out, "out", f"cannot be made: {error.strerror}") from None
     edited = store.altered("scene") and (out / _SCENE).is_file()
-    scene = _scene(values, out / _SCENE if edited else None, sources)
+    scene, given = _scene(values, out / _SCENE if edited else None, sources)
     network = FOLDER / "contacts" if values["contacts"]["network"] is None else Path(values["contacts"]["network"])
     loaded = load_contact_network(network)
     humanoid = humanoid_of(values)
@@ -71,7 +71,6 @@ def prepare_scene(
 
         source, folder = sources.name, store.folder
         told, camera = _of_contacts(scene), _of_camera(scene)
-        given = edited or (values["scene"] is not None and tells_boxes(Path(str(values["scene"])).expanduser()))
         boxes = [repr(box) for box in scene.boxes] if given else None
         run("poses", inputs["poses"], lambda advance, part: stages.find_poses(values, sources, advance, part))
         run(
@@ -139,18 +138,21 @@ def _out(values: Mapping[str, Any]) -> Path:
     return path.with_name(f"{path.stem}.reconstruct")
 
 
-def _scene(values: Mapping[str, Any], edited: Path | None, sources: Sources) -> Scene:
-    """The scene that is given, else the one in the folder of results where a user changed it, else none."""
+def _scene(values: Mapping[str, Any], edited: Path | None, sources: Sources) -> tuple[Scene, bool]:
+    """The scene that is given, else the one in the folder of results where a user changed it, else none.
+
+    And whether it says all boxes there are: one that a user changed does.
+    """
     path = convert(values["scene"], str | None, "conf/reconstruct.yaml", "scene")
     if path is not None and edited is not None:
         raise InputError(edited, "scene", f"was changed by hand: leave out scene={path} to use it, or remove the file")
     path = path if edited is None else str(edited)
     if path is None:
-        return Scene(fps=sources.fps)
-    scene = read_scene(Path(path).expanduser())
+        return Scene(fps=sources.fps), False
+    scene, told = read_told_scene(Path(path).expanduser())
     if abs(scene.fps - sources.fps) > 1e-9:
         raise InputError(path, "fps", f"{scene.fps:g}; contacts are counted at {sources.fps:g} frames/s here")
-    return scene
+    return scene, told or edited is not None
 
 
 def _inputs(values: Mapping[str, Any], sources: Sources, network: Path) -> dict[str, dict[str, Any]]:

@@ -274,9 +274,10 @@ def place_root(folder: Path, source: Path, scene: Scene, given: bool, humanoid: 
     qpos = motion.qpos.copy()
     qpos[:, :3] = root.positions - [0.0, 0.0, floor]
     stands = [replace(s, height=s.height - floor) for s in supports]
-    body = on_footholds(humanoid, replace(motion, qpos=qpos), stands, trust_of(folder))
+    trust = trust_of(folder)
+    body = on_footholds(humanoid, replace(motion, qpos=qpos), stands, trust)
     names = tuple(f"{side.capitalize()}Foot" for side in FEET)
-    body = replace(body, contacts=touching, contact_names=names)
+    body = replace(body, contacts=touching, contact_names=names, confidence=trust)
     write_native(body, out / "body.npz")
     rows = np.array([[s.foot, s.start, s.stop, s.height] for s in stands])
     np.savez_compressed(out / "root.npz", supports=rows, flight=root.flight)

@@ -192,6 +192,14 @@ def read_scene(path: str | Path) -> Scene:
     Raises:
         InputError: no such file, no YAML, a field missing, unknown or of another kind (``boxes[1].size``).
     """
+    return read_told_scene(path)[0]
+
+
+def read_told_scene(path: str | Path) -> tuple[Scene, bool]:
+    """A scene file, and whether it says which boxes there are, and be it none (``boxes: []``).
+
+    Raises as :func:`read_scene`.
+    """
     path = Path(path)
     values = read_yaml(path, "scene")
     if not isinstance(values, dict):
@@ -209,19 +217,9 @@ def read_scene(path: str | Path) -> Scene:
         raise InputError(path, sorted(unknown)[0][:60], f"is no field; there are {', '.join(sorted(known))}")
     try:
         plain = vars(from_mapping(_Plain, plain, str(path)))
-        return Scene(**plain, **parts)
+        return Scene(**plain, **parts), "boxes" in values
     except InputError as error:
         raise InputError(path, error.field, error.cause) from None
-
-
-def tells_boxes(path: str | Path) -> bool:
-    """Whether a scene file says which boxes there are, and be it none (``boxes: []``).
-
-    Raises:
-        InputError: no such file, or no YAML.
-    """
-    values = read_yaml(Path(path), "scene")
-    return isinstance(values, dict) and values.get("boxes") is not None
 
 
 def write_scene(scene: Scene, path: str | Path) -> None:

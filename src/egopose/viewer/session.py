@@ -10,6 +10,7 @@ from pathlib import Path
 
 from egopose.core.config import compose_config
 from egopose.core.errors import InputError
+from egopose.core.path_settings import Kind, checked_path
 from egopose.inference.reconstruction import reconstruction_folder, simulated_humanoid
 from egopose.motion.io import given_options
 from egopose.motion.notes import tell_notes
@@ -68,6 +69,9 @@ def open_viewer(
         if len(sources) > 1:
             raise InputError("view", "source", "a live stream is shown by itself; name nothing beside it")
         return LiveViewer(sources[0], place)
+    sources = [str(checked_path(source, Kind.EXISTING, "source")) for source in sources]
+    video = None if video is None else Path(checked_path(str(video), Kind.FILE, "video"))
+    simulated = None if simulated is None else Path(checked_path(str(simulated), Kind.FILE, "simulated"))
     made = None if scene else reconstruction_folder(Path(sources[0]), simulated)
     if made is not None or is_scene_folder(Path(sources[0])):
         if len(sources) > 1:
