@@ -18,9 +18,8 @@ from egopose.inference.scene_recovery import FITTED, PAGE, PLAN, SEARCH, recover
 from egopose.scene.scene_file import read_scene
 from egopose.scene.simulated import load_simulated
 
-SMALL = (
-    *("sampling.samples=16", "sampling.kept=4", "sampling.passes=2", "sampling.threads=1"),
-    *("refinement.sweeps=1", "refinement.window=6", "refinement.knots=6", "refinement.advance=6", "refinement.iterations=1"),
+SMALL = tuple(
+    f"refinement.{word}" for word in ("sweeps=1", "window=6", "knots=6", "changed=6", "iterations=1", "threads=1")
 )
 
 
@@ -59,7 +58,7 @@ def test_a_second_call_makes_nothing(folder: Path, monkeypatch: pytest.MonkeyPat
     monkeypatch.setattr(scene_recovery, "recovered", never)
     recover_scene(settings(folder), folder / "out", never)
     with pytest.raises(AssertionError, match="made again"):
-        recover_scene(settings(folder, "sampling.seed=1"), folder / "out", never)
+        recover_scene(settings(folder, "refinement.reach=0.5"), folder / "out", never)
 
 
 def test_a_search_that_breaks_off_leaves_the_last_one(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -70,7 +69,7 @@ def test_a_search_that_breaks_off_leaves_the_last_one(folder: Path, monkeypatch:
 
     monkeypatch.setattr(scene_recovery, "_keep", full)
     with pytest.raises(OSError, match="full"):
-        recover_scene(settings(folder, "sampling.seed=2"), folder / "out", report)
+        recover_scene(settings(folder, "refinement.reach=0.4"), folder / "out", report)
     assert (folder / "out" / PLAN).read_bytes() == before
 
 
@@ -87,7 +86,7 @@ def test_a_box_that_only_the_scene_knows_is_told_in_the_fitted_scene(folder: Pat
 
 
 def test_settings_are_read_before_anything_is_searched(folder: Path) -> None:
-    with pytest.raises(InputError, match="kept"):
-        recover_scene(settings(folder, "sampling.kept=99"), folder / "out", report)
+    with pytest.raises(InputError, match="advance"):
+        recover_scene(settings(folder, "refinement.advance=99"), folder / "out", report)
     with pytest.raises(InputError, match="none-such"):
         recover_scene(settings(folder, "policy=none-such"), folder / "out", report)

@@ -45,10 +45,8 @@ def walk(tmp_path_factory: pytest.TempPathFactory, humanoid: HumanoidModel) -> t
 def refiner(humanoid: HumanoidModel, walk: tuple[Array, Array], chosen: RefinementSettings) -> WindowRefiner:
     qpos, qvel = walk
     tracker = ReferenceTracker(load_policy(FOLDER / "tracker"), humanoid, qpos, qvel)
-    still, ground, trust = np.zeros((FRAMES, 3)), np.zeros(FRAMES), np.ones(FRAMES)
-    return WindowRefiner(
-        humanoid, tracker, Reference(qpos, qvel, still, ground, trust, np.zeros((0, 3)), np.zeros(0)), chosen
-    )
+    reference = Reference(qpos, qvel, np.zeros(FRAMES), np.ones(FRAMES), np.zeros((0, 3)), np.zeros(0))
+    return WindowRefiner(humanoid, tracker, reference, chosen)
 
 
 def tracked(humanoid: HumanoidModel, walk: tuple[Array, Array]) -> SimulatedMotion:
@@ -108,7 +106,7 @@ def test_knots_make_lines() -> None:
 
 @pytest.mark.parametrize(
     ("name", "value"),
-    [("window", 0), ("advance", 7), ("sweeps", -1), ("difference", 0.0), ("reach", -1.0), ("dampings", [])],
+    [("window", 0), ("advance", 7), ("sweeps", 0), ("difference", 0.0), ("reach", -1.0), ("dampings", [])],
 )
 def test_a_setting_that_cannot_be_is_named(name: str, value: object) -> None:
     with pytest.raises(InputError, match=name):

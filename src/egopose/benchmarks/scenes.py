@@ -22,6 +22,7 @@ import numpy as np
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+from egopose.benchmarks.scene_baselines import anchored, still
 from egopose.benchmarks.scene_clips import (
     Chosen,
     TrueClip,
@@ -41,7 +42,7 @@ from egopose.evaluation.scene_page import write_scene_page
 from egopose.humanoid.model import HumanoidModel
 from egopose.inference.reconstruction import PLAN
 from egopose.inference.scene_preparation import prepare_scene
-from egopose.inference.scene_recovery import REFINEMENT, SEARCH, recover_scene
+from egopose.inference.scene_recovery import SEARCH, recover_scene
 from egopose.motion.motion import Motion
 from egopose.scene.camera_file import save_camera
 from egopose.scene.clip import Clip, read_clip
@@ -160,7 +161,9 @@ def act_out(folder: Path, mode: str) -> None:
 
 
 def judged(humanoid: HumanoidModel, clip: TrueClip, folder: Path, acted: Sequence[str] = ()) -> list[dict[str, Any]]:
-    """Figures of the kinematic root in ``folder``, and of simulated motions: its ``plan.npz``, and those of ``acted``.
+    """Figures of simple answers, of the kinematic root in ``folder``, and of simulated motions.
+
+    Those are its ``plan.npz``, and those of ``acted``.
 
     Raises:
         InputError: a file is missing or damaged, or has other frames than the truth.
@@ -171,16 +174,22 @@ def judged(humanoid: HumanoidModel, clip: TrueClip, folder: Path, acted: Sequenc
     if start + len(found) > len(clip.simulated):
         raise InputError(folder / "body.npz", "qpos", f"{len(found)} frames; the truth has {len(clip.simulated)}")
     true = clip.part(humanoid, start, len(found))
-    kinematic = SceneMotion(found.body, found.touching, found.scene)
-    rows: list[dict[str, Any]] = [{"motion": "kinematic", **scene_figures(humanoid, kinematic, true, turn)}]
+    bodies = {
+        "still": still(folder, found),
+        "anchored": anchored(folder, found, humanoid),
+        "kinematic": found.body,
+    }
+    rows: list[dict[str, Any]] = [
+        {"motion": name, **scene_figures(humanoid, SceneMotion(body, found.touching, found.scene), true, turn)}
+        for name, body in bodies.items()
+    ]
     plans = {"simulated": folder / PLAN, **{f"simulated, {mode}": folder / mode / PLAN for mode in acted}}
     for motion, path in plans.items():
         if path.is_file():
             simulated = _simulated(path, found, humanoid)
             row = {"motion": motion, **scene_figures(humanoid, simulated, true, turn)}
-            cards = [card for card in (path.with_name(SEARCH), path.with_name(REFINEMENT)) if card.is_file()]
-            seconds = sum(float(read_json(card, card.stem)["seconds"]) for card in cards)
-            rows.append({**row, "seconds": seconds} if cards else row)
+            card = path.with_name(SEARCH)
+            rows.append({**row, "seconds": read_json(card, "search")["seconds"]} if card.is_file() else row)
     return rows
 
 

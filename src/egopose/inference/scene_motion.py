@@ -1,38 +1,41 @@
-"""From a prepared clip to a motion that physics allows: the sampler, set up with the clip's reference and scene."""
+"""From a prepared clip to a motion that physics allows: boxes where the feet say, then a body near its poses."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import replace
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from egopose.core.errors import InputError
 from egopose.data.reference import reference_states
 from egopose.humanoid.model import HumanoidModel
-from egopose.inference.motion_cost import MotionCost
 from egopose.inference.reference_tracker import ReferenceTracker
-from egopose.inference.sampled_motion import Found, FreeBoxes, MotionSampler, SamplingSettings
 from egopose.inference.scene_stages import sole_points, supports_of, trust_of
-from egopose.motion.io._npz import read_arrays
+from egopose.inference.window_refinement import Reference, RefinementSettings, WindowRefiner
 from egopose.motion.motion import Motion
 from egopose.motion.rotations import Array
 from egopose.pipeline.agent import Policy
-from egopose.scene.balance import lean, leaned
-from egopose.scene.clip import Clip, box_poses, humanoid_in, wanted_contacts
-from egopose.scene.footholds import on_footholds
-from egopose.scene.scene_file import FREE, Scene
+from egopose.scene.clip import Clip, box_poses, humanoid_in
+from egopose.scene.footholds import BoxTops, on_footholds
+from egopose.scene.scene_file import FREE, Box, Scene
+from egopose.scene.simulated import SimulatedMotion
 from egopose.scene.standing import Standing, standing
 from egopose.scene.supports import touched
 
-#: Frames before a motion stands on a box, from which on the box matters to it: what the tracker sees ahead, and more.
-_AHEAD = 12
-#: m and rad, that a box is off along, across, in height and yaw where feet tell of it: heights were 2 to 6 cm off.
-_SPREAD = np.array([0.08, 0.08, 0.05, 0.1])
-#: m: a box this near to a part of the body may be touched.
-_NEAR = 0.25
+
+@dataclass(frozen=True)
+class Recovered:
+    """What physics made of a clip.
+
+    Args:
+        motion: simulated.
+        cost: of it, see :meth:`~egopose.inference.window_refinement.WindowRefiner.cost`, after each sweep.
+    """
+
+    motion: SimulatedMotion
+    cost: tuple[float, ...]
 
 
 def recovered(
@@ -40,74 +43,79 @@ def recovered(
     clip: Clip,
     humanoid: HumanoidModel,
     policy: Policy,
-    settings: SamplingSettings,
-    free: bool,
+    settings: RefinementSettings,
     advance: Callable[[int], None] = lambda _: None,
-) -> Found:
-    """A motion near a prepared clip's that physics allows, among its boxes.
+) -> Recovered:
+    """A motion near a prepared clip's that physics allows, among the boxes of its scene.
 
-    Two references are tried in the first pass: the poses as they are, and leaned until their feet carry them. The one
-    whose bodies do better is searched further.
+    The best of all sweeps is the motion.
 
     Args:
         folder: of the preparation.
-        clip: read from it.
+        clip: read from it; its boxes stay where they are.
         humanoid: without boxes.
         policy: a tracker.
-        settings: see :class:`SamplingSettings`.
-        free: whether boxes may change within their ranges; else they stay at the scene's first guess.
-        advance: told frames done, of ``(settings.passes + 1)`` times the clip's.
+        settings: see :class:`~egopose.inference.window_refinement.RefinementSettings`.
+        advance: told frames done, of ``settings.sweeps`` times the clip's.
 
     Raises:
         InputError: the policy follows no motion, or the clip stands on nothing.
     """
     if "ahead" not in policy.config["task"]:
         raise InputError(policy.path, "task.ahead", "this policy follows no motion: give a tracker's checkpoint")
-    samplers = [
-        _sampler(folder, replace(clip, body=body), humanoid, policy, settings, free)
-        for body in (clip.body, _leaned(folder, clip, humanoid))
-    ]
-    found = [sampler.search(range(1), advance) for sampler in samplers]
-    best = int(np.argmin([one.totals[0] for one in found]))
-    out = found[best]
-    if settings.passes > 1:
-        out = samplers[best].search(range(1, settings.passes), advance)
-    for sampler in samplers:
-        sampler.close()
-    return out
+    body, ground = among_boxes(folder, clip, humanoid)
+    states = reference_states(humanoid, body)
+    qpos, qvel = states["qpos"].numpy(), states["qvel"].numpy()
+    reference = Reference(qpos, qvel, ground, trust_of(folder), *box_poses(clip.scene))
+    tracker = ReferenceTracker(policy, humanoid, qpos, qvel)
+    refiner = WindowRefiner(humanoid_in(clip.scene, humanoid), tracker, reference, settings)
+    costs: list[float] = []
+    best, offsets = None, None
+    for _ in range(settings.sweeps):
+        motion, offsets = refiner.refine(qpos[0], qvel[0], offsets, advance)
+        costs.append(refiner.cost(motion))
+        best = motion if best is None or costs[-1] < min(costs[:-1]) else best
+    refiner.close()
+    assert best is not None
+    return Recovered(best, tuple(costs))
 
 
-def _sampler(
-    folder: Path, clip: Clip, humanoid: HumanoidModel, policy: Policy, settings: SamplingSettings, free: bool
-) -> MotionSampler:
-    among = humanoid_in(clip.scene, humanoid)
-    states = reference_states(humanoid, clip.body)
-    reference = {name: states[name].numpy() for name in ("qpos", "qvel", "xpos")}
+def among_boxes(folder: Path, clip: Clip, humanoid: HumanoidModel) -> tuple[Motion, Array]:
+    """The clip's body with its feet on and over the boxes of its scene, and ``[T]`` m the height of what it stands on.
+
+    Raises:
+        InputError: it stands on nothing.
+    """
+    stands, sizes = standing_of(folder, clip, humanoid), _sizes(clip.scene)
+    tops, headings = box_poses(clip.scene)
+    ground = stands.ground(tops[None])[0]
+    if not len(tops):
+        return clip.body, ground
+    qpos = clip.body.qpos.copy()
+    qpos[:, :3] += stands.moves(tops[None], headings[None], sizes)[0]
+    pairs = zip(supports_of(folder), stands.surfaces(tops[None])[0].tolist(), strict=True)
+    supports = [replace(support, height=height) for support, height in pairs]
+    boxes = BoxTops(tops, headings, sizes)
+    return on_footholds(humanoid, replace(clip.body, qpos=qpos), supports, trust_of(folder), boxes=boxes), ground
+
+
+def fitted(folder: Path, clip: Clip, humanoid: HumanoidModel) -> Scene:
+    """The scene with each box where the clip's feet stand on it, as far as the scene leaves it free.
+
+    What may still change shrinks to what is left of it. A box on which no foot stands stays.
+
+    Raises:
+        InputError: the clip stands on nothing.
+    """
     stands = standing_of(folder, clip, humanoid)
-    wanted = wanted_contacts(clip.scene, humanoid, len(clip))
-    cost = MotionCost(among, reference, wanted, trust_of(folder), settings.cost)
-    tracker = ReferenceTracker(policy, humanoid, reference["qpos"], reference["qvel"])
-    boxes = free_boxes(clip.scene, stands, reference["xpos"], free)
-    return MotionSampler(among, tracker, stands, cost, boxes, settings, reference["qpos"][0], reference["qvel"][0])
-
-
-def _leaned(folder: Path, clip: Clip, humanoid: HumanoidModel) -> Motion:
-    """The clip's body turned about its feet until they carry it."""
-    feet, com = sole_points(humanoid, clip.body).mean(axis=2), reference_states(humanoid, clip.body)["com"].numpy()
-    sight = read_arrays(folder / "orientation.npz", ("to_world",))["to_world"][:, :, 2]
-    flight = read_arrays(folder / "root.npz", ("flight",))["flight"].astype(bool)
-    # Where contacts were missed, the lower foot carries.
-    lower = np.arange(feet.shape[1]) == feet[..., 2].argmin(axis=1)[:, None]
-    stands = clip.touching | (lower & ~clip.touching.any(axis=1, keepdims=True) & ~flight[:, None])
-    turn = lean(feet, stands, com, sight, clip.body.fps)
-    pivot = (stands[..., None] * feet).sum(axis=1) / np.maximum(stands.sum(axis=1), 1)[:, None]
-    pivot = np.where(stands.any(axis=1)[:, None], pivot, feet.mean(axis=1))
-    body = replace(clip.body, qpos=leaned(clip.body.qpos, turn, pivot))
-    return on_footholds(humanoid, body, supports_of(folder), trust_of(folder))
+    tops, headings = box_poses(clip.scene)
+    changes = [_suits(k, tops, headings, _sizes(clip.scene), stands) for k in range(len(tops))]
+    boxes = [_changed(box, change) for box, change in zip(clip.scene.boxes, changes, strict=False)]
+    return replace(clip.scene, boxes=(*boxes, *clip.scene.boxes[len(boxes) :]))
 
 
 def standing_of(folder: Path, clip: Clip, humanoid: HumanoidModel) -> Standing:
-    """What the clip's reference stands on.
+    """What the clip's body stands on.
 
     Raises:
         InputError: it stands on nothing.
@@ -121,20 +129,12 @@ def standing_of(folder: Path, clip: Clip, humanoid: HumanoidModel) -> Standing:
     return standing(supports, on, feet, len(clip), clip.body.fps)
 
 
-def free_boxes(scene: Scene, stands: Standing, places: Array, free: bool) -> FreeBoxes:
-    """The scene's boxes and what of them may change; ``places [T, B, 3]`` m are the reference's bodies."""
-    tops, headings = box_poses(scene)
-    ranges = np.array([[box.free.get(name, (0.0, 0.0)) for name in FREE] for box in scene.boxes]).reshape(-1, 4, 2)
-    ranges = ranges if free else np.zeros_like(ranges)
-    sizes = np.array([box.size for box in scene.boxes]).reshape(-1, 2)
-    needed = np.array([_needed(k, tops, sizes, stands, places) for k in range(len(tops))], dtype=np.int64)
-    seen = np.array([_suits(k, tops, headings, sizes, stands) for k in range(len(tops))]).reshape(-1, 4)
-    low, high = ranges[..., 0], ranges[..., 1]
-    return FreeBoxes(tops, headings, sizes, low, high, np.clip(seen, low, high), _SPREAD, needed)
+def _sizes(scene: Scene) -> Array:
+    return np.array([box.size for box in scene.boxes]).reshape(-1, 2)
 
 
 def _suits(box: int, tops: Array, headings: Array, sizes: Array, stands: Standing) -> Array:
-    """``[4]`` the change with which the reference's feet stand on the box; no further level than they must."""
+    """``[4]`` the change with which feet stand on the box; no further level than they must."""
     on = np.flatnonzero(stands.box == box)
     if not len(on):
         return np.zeros(4)
@@ -143,10 +143,23 @@ def _suits(box: int, tops: Array, headings: Array, sizes: Array, stands: Standin
     return -np.array([cos * moves[0] + sin * moves[1], cos * moves[1] - sin * moves[0], moves[2], 0.0])
 
 
-def _needed(box: int, tops: Array, sizes: Array, stands: Standing, places: Array) -> int:
-    """The frame from which on the box may touch the body, or the body's way leads onto it."""
-    on: NDArray[np.intp] = np.flatnonzero(stands.share[:, stands.box == box].sum(axis=1) > 0.01)
-    reach = 0.5 * float(np.linalg.norm(sizes[box])) + _NEAR
-    near = np.flatnonzero((np.linalg.norm(places[..., :2] - tops[box, :2], axis=2) < reach).any(axis=1))
-    frames: Sequence[int] = [*(on - _AHEAD)[:1].tolist(), *near[:1].tolist(), len(places)]
-    return max(min(frames), 0)
+def _changed(box: Box, wanted: Array) -> Box:
+    change, left = np.zeros(4), {}
+    for number, name in enumerate(FREE):
+        if name in box.free:
+            low, high = box.free[name]
+            change[number] = np.clip(wanted[number], low, high)
+            left[name] = (min(low - change[number], 0.0), max(high - change[number], 0.0))
+    assert box.place is not None
+    assert box.height is not None
+    assert box.yaw is not None
+    along, across, up, turn = change.tolist()
+    cos, sin = np.cos(box.yaw), np.sin(box.yaw)
+    place = box.place[0] + cos * along - sin * across, box.place[1] + sin * along + cos * across
+    return replace(
+        box,
+        place=(round(float(place[0]), 4), round(float(place[1]), 4)),
+        height=round(max(box.height + up, 0.0), 4),
+        yaw=round(box.yaw + turn, 4),
+        free=left,
+    )

@@ -264,7 +264,7 @@ def place_root(folder: Path, source: Path, scene: Scene, given: bool, humanoid: 
     # Where a scene tells the boxes, supports on one thing are put together by it, and not by their heights.
     settings = replace(_ROOT, level=0.0, level_in_flight=0.0) if given else _ROOT
     root, seen, focal = _seen_root(folder, motion, touching, humanoid, scene, settings)
-    feet, com = _about_pelvis(motion, humanoid)
+    feet, com = about_pelvis(motion, humanoid)
     floor = floor_height(root.supports, touched(scene, root.supports))
     soles = (root.positions[:, None, None] + feet).mean(axis=2)[..., :2]
     _, on = _stood_on(scene, given, root.supports, floor, soles, motion.qpos)
@@ -295,7 +295,7 @@ def _stood_on(
     return touches, levels(supports, touches, floor, soles, rot.yaw(qpos[:, 3:7]))
 
 
-def _about_pelvis(motion: Motion, humanoid: HumanoidModel) -> tuple[Array, Array]:
+def about_pelvis(motion: Motion, humanoid: HumanoidModel) -> tuple[Array, Array]:
     """Soles ``[T, 2, 2, 3]`` and centre of mass ``[T, 3]``, m, relative to the pelvis."""
     pelvis = motion.qpos[:, :3]
     com = reference_states(humanoid, motion)["com"].numpy() - pelvis
@@ -314,7 +314,7 @@ def _seen_root(
 
     A camera that travels tells nothing: the root is by feet and gravity, and there is no focal length.
     """
-    feet, com = _about_pelvis(motion, humanoid)
+    feet, com = about_pelvis(motion, humanoid)
     track = load_track(folder / "joints.npz")
     size, pelvis = track.image_size, track.pixels[:, BODY_25.index("mid_hip")]
     if size is None or camera_moves(folder, scene) == "track" or not np.isfinite(pelvis).any():

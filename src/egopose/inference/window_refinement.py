@@ -68,7 +68,7 @@ class RefinementSettings:
         changed: frames of a window in which offsets have knots; the rest shows what comes of them.
         advance: frames that a body takes before the next window.
         iterations: of Gauss-Newton in a window.
-        sweeps: over the clip; 0 leaves the motion as it was found.
+        sweeps: over the clip.
         difference: rad, of a knot that is tried.
         reach: rad that a step may change an offset by.
         dampings: of the steps that are tried, 1/rad^2.
@@ -89,14 +89,12 @@ class RefinementSettings:
     weights: RefinementWeights
 
     def __post_init__(self) -> None:
-        for name in ("window", "knots", "changed", "advance", "iterations", "threads"):
+        for name in ("window", "knots", "changed", "advance", "iterations", "sweeps", "threads"):
             if getattr(self, name) < 1:
                 raise InputError("refinement", name, "must be at least 1")
         for name, most in (("changed", "window"), ("advance", "changed")):
             if getattr(self, name) > getattr(self, most):
                 raise InputError("refinement", name, f"{getattr(self, name)} frames are more than {most}")
-        if self.sweeps < 0:
-            raise InputError("refinement", "sweeps", "must not be negative")
         for name in ("difference", "reach"):
             if not getattr(self, name) > 0:
                 raise InputError("refinement", name, "must be positive, rad")
@@ -115,8 +113,7 @@ class Reference:
     """What a body is brought near, in the world of its boxes.
 
     Args:
-        qpos, qvel: ``[T, nq]``, ``[T, nv]``; already moved by ``moves``.
-        moves: ``[T, 3]`` m: how far the tracker's own reference is moved.
+        qpos, qvel: ``[T, nq]``, ``[T, nv]``.
         ground: ``[T]`` m: the height of what it stands on.
         trust: ``[T]`` how far each frame is to be believed, 0 to 1.
         box_tops, box_headings: ``[K, 3]`` m, ``[K]`` rad.
@@ -124,7 +121,6 @@ class Reference:
 
     qpos: Array
     qvel: Array
-    moves: Array
     ground: Array
     trust: Array
     box_tops: Array
@@ -147,7 +143,7 @@ class WindowRefiner:
 
     Args:
         humanoid: among the boxes.
-        tracker: drives the body; knows the reference before it is moved.
+        tracker: drives the body towards the same reference.
         reference: see :class:`Reference`.
         settings: see :class:`RefinementSettings`.
     """
@@ -165,7 +161,8 @@ class WindowRefiner:
         if len(reference.box_headings):
             tops, headings = np.tile(reference.box_tops, (count, 1, 1)), np.tile(reference.box_headings, (count, 1))
             self._physics.place_boxes(np.arange(count), tops, headings)
-        self._moves = np.broadcast_to(reference.moves, (count, *reference.moves.shape))
+        # The tracker may be told of a reference that is moved; this one is where it should be.
+        self._moves = np.zeros((count, len(reference.qpos), 3))
         self._ground = np.broadcast_to(reference.ground, (count, len(reference.ground)))
         self._places = self._physics.poses(reference.qpos)["xpos"]
         w, bodies = settings.weights, self._places.shape[1]

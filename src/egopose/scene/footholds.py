@@ -22,6 +22,7 @@ from egopose.motion.smooth_inverse_kinematics import Smoothness, solve_smooth
 from egopose.scene.root import Support
 
 _DEEP = 0.002  # m: a corner that is less deep is on the ground
+_BESIDE = 0.03  # m from a box's edge
 
 
 @dataclass(frozen=True)
@@ -50,14 +51,36 @@ class FootholdSettings:
     rounds: int = 3
 
 
+@dataclass(frozen=True)
+class BoxTops:
+    """Upper faces of boxes: centres ``tops [K, 3]`` m, ``headings [K]`` rad and ``sizes [K, 2]`` m."""
+
+    tops: Array
+    headings: Array
+    sizes: Array
+
+    def heights(self, points: Array) -> Array:
+        """``[...]`` m of what is under ``points [..., 2]`` m: the highest box there, or the floor.
+
+        A point a little beside a box counts as over it: feet are not placed to the centimetre.
+        """
+        away = points[..., None, :] - self.tops[:, :2]
+        cos, sin = np.cos(self.headings), np.sin(self.headings)
+        along = np.abs(cos * away[..., 0] + sin * away[..., 1])
+        across = np.abs(cos * away[..., 1] - sin * away[..., 0])
+        over = (along <= 0.5 * self.sizes[:, 0] + _BESIDE) & (across <= 0.5 * self.sizes[:, 1] + _BESIDE)
+        return np.asarray(np.where(over, self.tops[:, 2], 0.0).max(axis=-1, initial=0.0))
+
+
 def on_footholds(
     humanoid: HumanoidModel,
     motion: Motion,
     supports: Sequence[Support],
     trust: Array,
     settings: FootholdSettings | None = None,
+    boxes: BoxTops | None = None,
 ) -> Motion:
-    """The motion with its standing soles where they stand, and smooth.
+    """The motion with its standing soles where they stand and no sole in what is below it, and smooth.
 
     Args:
         humanoid: whose skeleton the motion is on.
@@ -65,6 +88,7 @@ def on_footholds(
         supports: of its feet; a foot is 0 for the right and 1 for the left.
         trust: ``[T]`` how far each frame is to be believed, 0 to 1.
         settings: see :class:`FootholdSettings`; None for its own values.
+        boxes: that feet pass over or beside; None where their places are not known.
     """
     settings = settings or FootholdSettings()
     corners, joints, offsets = _soles(humanoid, motion)
@@ -80,7 +104,7 @@ def on_footholds(
         weight[span, foot] = settings.stands * stands
     positions, quats = motion.forward_kinematics()
     bodies = positions.shape[1]
-    ground = _ground(len(motion), supports)[..., None]
+    lowest = _ground(len(motion), supports)[..., None]
     qpos = motion.qpos
     for _ in range(settings.rounds):
         targets = Targets(
@@ -109,6 +133,7 @@ def on_footholds(
         )
         # A point of the sole that has sunk is held where it is, at the ground's height.
         found = _soles(humanoid, replace(motion, qpos=qpos))[0]
+        ground = lowest if boxes is None else np.maximum(lowest, boxes.heights(found[..., :2]))
         sunk = (found[..., 2] < ground - _DEEP) | (weight == settings.clear)
         new = sunk & (weight < settings.clear)
         goal = np.where(new[..., None], np.stack([*np.moveaxis(found[..., :2], -1, 0), ground + 0 * weight], -1), goal)
