@@ -12,7 +12,8 @@ from egopose.checkpoint.contacts import load_contact_network
 from egopose.core.config import compose_config, from_mapping
 from egopose.data.preparation import humanoid_of
 from egopose.pipeline.mocap_sources import clips_of
-from egopose.training.contact_network import ContactClip, ContactSettings, accuracy_table, contact_clip, overall
+from egopose.training.contact_clips import ContactClip, ContactSettings, contact_clip
+from egopose.training.contact_network import accuracy_table, overall
 
 MOVING = ("pan", "zoom", "track")
 DRAWS = 1

@@ -12,13 +12,8 @@ from egopose.checkpoint.contacts import save_contact_network
 from egopose.core.config import from_mapping
 from egopose.data.preparation import humanoid_of
 from egopose.pipeline.mocap_sources import clips_of, folder_to_make
-from egopose.training.contact_network import (
-    ContactSettings,
-    accuracy_table,
-    contact_clip,
-    overall,
-    train_contact_network,
-)
+from egopose.training.contact_clips import ContactSettings, contact_clip
+from egopose.training.contact_network import accuracy_table, draw_views, overall, train_contact_network
 
 _SOURCE = "conf/contacts.yaml"
 _CAMERAS = 100  # seed of the cameras it is judged through: the same for every network
@@ -39,7 +34,7 @@ def train_contacts(values: Mapping[str, Any]) -> None:
     def tell(epoch: int, loss: float, seconds: float) -> None:
         print(f"epoch {epoch} of {settings.epochs}, loss {loss:.4f}, {seconds:.1f} s", file=sys.stderr, flush=True)
 
-    network = train_contact_network(train, settings, tell)
+    network = train_contact_network(draw_views(train, settings), settings, tell)
     save_contact_network(network, asdict(settings), out / "network")
     print(f"network: {out / 'network'}")
     if not test:
