@@ -19,7 +19,7 @@ from egopose.core.errors import InputError
 from egopose.pipeline.contacts import train_contacts
 from egopose.training.contact_clips import ContactClip, ContactSettings, contact_clip, seen_by
 from egopose.training.contact_examples import PIECE, pieces
-from egopose.training.contact_network import accuracy_table, draw_views, overall, train_contact_network
+from egopose.training.contact_network import accuracy_table, draw_views, judging_views, overall, train_contact_network
 
 TINY: dict[str, Any] = {"widths": (16,), "views": 2, "epochs": 2, "batch": 4}
 #: The paper's network, as small.
@@ -82,7 +82,7 @@ def test_it_learns_a_walk_and_is_the_same_each_time(kind: dict[str, Any]) -> Non
     told: list[float] = []
     network = train_contact_network(views, simple, lambda epoch, loss, seconds: told.append(loss))
     assert told[-1] < 0.5 * told[0]
-    table = accuracy_table(network, clips[:1], simple, 1)
+    table = accuracy_table(network, judging_views(clips[:1], simple, 1))
     assert overall(table["undone"]["pan"], clips[:1]) > 0.85
     few = replace(simple, epochs=1)
     one, other = (train_contact_network(draw_views(clips[:2], few), few).state_dict() for _ in range(2))
@@ -141,7 +141,7 @@ def test_the_command_trains_judges_and_saves(
     assert set(result["accuracy"]["as seen"]) == {"fixed", "pan", "zoom", "track"}
     network = load_contact_network(out / "network")
     assert not network.training
-    table = accuracy_table(network, [clip()], settings(), 0)
+    table = accuracy_table(network, judging_views([clip()], settings(), 0))
     assert 0.0 <= overall(table["as seen"]["fixed"], [clip()]) <= 1.0
     changed = json.loads((config := out / "network" / "components" / "0000-config" / "value.json").read_text())
     config.write_text(json.dumps({**changed, "network": "lstm"}))

@@ -6,8 +6,6 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from torch import nn
-
 from egopose.checkpoint.checkpoint import RunCheckpoint, metadata_of, read_json
 from egopose.core.config import convert
 from egopose.core.errors import InputError
@@ -23,7 +21,7 @@ _NETWORKS: dict[str, type[ContactNetwork] | type[WindowNetwork]] = {
 }
 
 
-def save_contact_network(network: nn.Module, settings: Mapping[str, Any], folder: Path) -> None:
+def save_contact_network(network: ContactNetwork | WindowNetwork, settings: Mapping[str, Any], folder: Path) -> None:
     """Write a network to ``folder`` with the settings that made it: ``network`` is its kind, ``widths`` its layers."""
     metadata = metadata_of(_KIND, len(FEET), 0, 0, 0.0)
     RunCheckpoint({"network": network, "config": dict(settings)}).save(folder, metadata=metadata)

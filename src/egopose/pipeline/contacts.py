@@ -13,7 +13,13 @@ from egopose.core.config import from_mapping
 from egopose.data.preparation import humanoid_of
 from egopose.pipeline.mocap_sources import clips_of, folder_to_make
 from egopose.training.contact_clips import ContactSettings, contact_clip
-from egopose.training.contact_network import accuracy_table, draw_views, overall, train_contact_network
+from egopose.training.contact_network import (
+    accuracy_table,
+    draw_views,
+    judging_views,
+    overall,
+    train_contact_network,
+)
 
 _SOURCE = "conf/contacts.yaml"
 _CAMERAS = 100  # seed of the cameras it is judged through: the same for every network
@@ -40,7 +46,7 @@ def train_contacts(values: Mapping[str, Any]) -> None:
     if not test:
         print("no source holds people out: nothing is judged")
         return
-    table = accuracy_table(network, test, settings, _CAMERAS)
+    table = accuracy_table(network, judging_views(test, settings, _CAMERAS))
     frames = {clip.name: len(clip.points) for clip in test}
     (out / "result.json").write_text(json.dumps({"accuracy": table, "frames": frames, "seed": settings.seed}, indent=1))
     for name, row in table.items():

@@ -125,7 +125,7 @@ def contact_features(keypoints: Array, confidence: Array, camera: Array | None =
     keypoints, seen = checked_keypoints(keypoints, confidence, camera)
     frames = len(keypoints)
     to_common = np.tile(np.eye(3), (frames, 1, 1)) if camera is None else np.asarray(camera, dtype=np.float64)
-    from_common = np.linalg.inv(to_common)
+    from_common = np.linalg.inv(to_common).astype(np.float64)
     common = _interpolated(_mapped(to_common, keypoints), seen)
     own = _mapped(from_common, common)
     movements = np.zeros_like(own)

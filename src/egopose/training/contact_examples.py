@@ -8,7 +8,7 @@ from itertools import pairwise
 
 import numpy as np
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from egopose.motion.rotations import Array
 from egopose.scene.contacts import ContactNetwork, contact_features, mirrored_features, without_last_movement
@@ -41,7 +41,7 @@ class NetworkKind:
         mirrored: inputs of the mirror image, in which the feet change places.
     """
 
-    make: Callable[[tuple[int, ...], float, float], nn.Module]
+    make: Callable[[tuple[int, ...], float, float], ContactNetwork | WindowNetwork]
     inputs: Callable[[Array, Array, Array | None], np.ndarray]
     examples: Callable[[np.ndarray, np.ndarray, np.ndarray, np.random.Generator], Examples]
     mirrored: Callable[[Tensor], Tensor]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,8 +13,9 @@ from torch import nn
 from egopose.core.errors import InputError
 from egopose.core.torch_settings import torch_threads
 from egopose.motion.rotations import Array
-from egopose.scene.contacts import ContactEstimator
+from egopose.scene.contacts import ContactEstimator, ContactNetwork
 from egopose.scene.virtual_camera import KINDS
+from egopose.scene.window_contacts import WindowNetwork
 from egopose.training.contact_clips import ContactClip, ContactSettings, SeenClip, seen_by
 from egopose.training.contact_examples import NETWORKS, Examples, joined
 
@@ -61,7 +62,7 @@ def train_contact_network(
     views: Sequence[Sequence[View]],
     settings: ContactSettings,
     progress: Callable[[int, float, float], None] | None = None,
-) -> nn.Module:
+) -> ContactNetwork | WindowNetwork:
     """The trained network, in evaluation mode.
 
     Args:
@@ -123,33 +124,48 @@ def contact_accuracy(network: ContactEstimator, seen: SeenClip, undone: bool) ->
     return (estimated == seen.contacts).astype(np.float64)
 
 
+def judging_views(
+    clips: Sequence[ContactClip], settings: ContactSettings, seed: int, draws: int = 1
+) -> dict[str, dict[str, list[SeenClip]]]:
+    """``{kind: {clip: views}}``: clips of people that no network has seen, through cameras that none has seen.
+
+    Args:
+        clips: the clips.
+        settings: the keypoints' errors.
+        seed: of the cameras, the same from one kind to the other.
+        draws: cameras of each kind for each clip.
+    """
+    return {
+        kind: {
+            clip.name: [seen_by(clip, kind, settings, np.random.default_rng([seed, k, place])) for k in range(draws)]
+            for place, clip in enumerate(clips)
+        }
+        for kind in KINDS
+    }
+
+
 def accuracy_table(
-    network: ContactEstimator,
-    clips: Sequence[ContactClip],
-    settings: ContactSettings,
-    seed: int,
-    draws: int = 1,
+    network: ContactEstimator, views: Mapping[str, Mapping[str, Sequence[SeenClip]]]
 ) -> dict[str, dict[str, dict[str, float]]]:
-    """Share of feet and frames in which the network is right, through cameras that it has not seen.
+    """Share of feet and frames in which the network is right.
 
     Args:
         network: in evaluation mode.
-        clips: of people that it has not seen.
-        settings: the keypoints' errors.
-        seed: of the cameras: the same for networks that are compared, and from one kind of camera to the other.
-        draws: cameras of each kind for each clip.
+        views: of :func:`judging_views`.
 
     Returns:
         ``{as seen | undone: {kind: {clip: share}}}``.
     """
-    out: dict[str, dict[str, dict[str, float]]] = {"as seen": {}, "undone": {}}
-    for kind in KINDS:
-        for place, clip in enumerate(clips):
-            seen = [seen_by(clip, kind, settings, np.random.default_rng([seed, k, place])) for k in range(draws)]
-            for name, row in out.items():
-                shares = [contact_accuracy(network, one, name == "undone").mean() for one in seen]
-                row.setdefault(kind, {})[clip.name] = float(np.mean(shares))
-    return out
+    return {
+        name: {
+            kind: {
+                clip: float(np.mean([contact_accuracy(network, one, undone).mean() for one in seen]))
+                for clip, seen in rows.items()
+            }
+            for kind, rows in views.items()
+        }
+        for name, undone in (("as seen", False), ("undone", True))
+    }
 
 
 def overall(row: dict[str, float], clips: Sequence[ContactClip]) -> float:
