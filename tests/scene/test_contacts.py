@@ -95,7 +95,8 @@ def test_the_mirror_image_swaps_the_legs() -> None:
 
 
 def test_it_sees_sixteen_frames_to_either_side() -> None:
-    network, points, sure = ContactNetwork((8,)).eval(), legs(80), np.ones((80, 7))
+    torch.manual_seed(0)
+    network, points, sure = ContactNetwork((32,)).eval(), legs(80), np.ones((80, 7))
     told = network.probabilities(points, sure)
     assert told.shape == (80, 2)
     assert ((told > 0) & (told < 1)).all()
