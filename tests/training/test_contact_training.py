@@ -17,7 +17,7 @@ from egopose.checkpoint.contacts import load_contact_network
 from egopose.core.config import compose_config, from_mapping
 from egopose.core.errors import InputError
 from egopose.pipeline.contacts import train_contacts
-from egopose.training.contact_clips import ContactClip, ContactSettings, contact_clip, seen_by
+from egopose.training.contact_clips import ContactClip, ContactSettings, another_body, contact_clip, seen_by
 from egopose.training.contact_examples import PIECE, pieces
 from egopose.training.contact_network import accuracy_table, draw_views, judging_views, overall, train_contact_network
 
@@ -57,6 +57,25 @@ def test_a_foot_that_stands_above_the_floor_is_not_learned_from() -> None:
     assert clip().doubtful.mean() < 0.1
     (view,) = draw_views([raised], settings(views=1))[0]
     np.testing.assert_array_equal(view.known, ~raised.doubtful)
+
+
+def test_another_body_stands_where_the_first_one_stood() -> None:
+    walk = clip()
+    other = another_body(walk, 0.2, np.random.default_rng(3))
+    np.testing.assert_array_equal(
+        another_body(walk, 0.0, np.random.default_rng(3)).points[:, [0, 3, 6]], walk.points[:, [0, 3, 6]]
+    )
+    np.testing.assert_allclose(another_body(walk, 0.0, np.random.default_rng(3)).points, walk.points, atol=1e-12)
+    # Ankles keep their place on the floor, so feet that stood still do.
+    np.testing.assert_array_equal(other.points[:, [3, 6], :2], walk.points[:, [3, 6], :2])
+
+    def bones(points: np.ndarray) -> np.ndarray:
+        joints = points[:, [1, 2, 3]]
+        return np.linalg.norm(np.diff(joints, axis=1), axis=-1).mean(axis=0)
+
+    assert np.abs(bones(other.points) / bones(walk.points) - 1).max() > 0.05
+    hips = [np.linalg.norm(points[:, 1] - points[:, 4], axis=-1).mean() for points in (other.points, walk.points)]
+    assert abs(hips[0] / hips[1] - 1) > 0.05
 
 
 def test_keypoints_are_as_wrong_as_asked() -> None:

@@ -6,7 +6,7 @@ put on top. The labels come from the feet's heights and speeds (:mod:`egopose.mo
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -29,6 +29,7 @@ class ContactSettings:
     Args:
         cameras: share of each of :data:`egopose.scene.virtual_camera.KINDS` in training.
         undone: share of the moving cameras whose motion is undone.
+        bodies: standard deviation of the logarithm of each of a drawn body's proportions, see :func:`another_body`.
         error: mean distance of a keypoint from its joint, in body heights; drawn for each clip.
         lasting: share of the error's variance that lasts for about a second.
         definition: share of it that is constant: where the estimator's joint lies beside the skeleton's.
@@ -45,6 +46,7 @@ class ContactSettings:
 
     cameras: dict[str, float]
     undone: float
+    bodies: float
     error: Range
     lasting: float
     definition: float
@@ -130,10 +132,32 @@ def contact_clip(humanoid: HumanoidModel, motion: Motion, settings: ContactSetti
     return ContactClip(motion.name, points, feet, doubtful & ~feet, (length + ankle) / 0.53, motion.fps)
 
 
+def another_body(clip: ContactClip, spread: float, rng: np.random.Generator) -> ContactClip:
+    """The clip on legs of other proportions; what stands still goes on standing still.
+
+    All takes come on one skeleton. Legs become longer against the stride, hips wider, thighs longer against shanks.
+
+    Args:
+        clip: on the floor at z = 0.
+        spread: standard deviation of the logarithm of each proportion.
+        rng: draws them.
+    """
+    tall, wide, thigh = np.exp(spread * rng.normal(size=3))
+    points = clip.points * [1.0, 1.0, tall]
+    pelvis, hips, knees, ankles = points[:, :1], points[:, [1, 4]], points[:, [2, 5]], points[:, [3, 6]]
+    hips = pelvis + wide * (hips - pelvis)
+    # The knee moves along the line from hip to ankle. A thigh is about half of it.
+    knees = knees + 0.5 * (thigh - 1) * (ankles - hips)
+    legs = np.stack([hips, knees, ankles], axis=2)  # [T, side, 3, 3]
+    points = np.concatenate([pelvis, legs[:, 0], legs[:, 1]], axis=1)
+    return replace(clip, points=points, height=tall * clip.height)
+
+
 def seen_by(
     clip: ContactClip, kind: str, settings: ContactSettings, rng: np.random.Generator, points: int = 400
 ) -> SeenClip:
-    """The clip through a camera of ``kind``, whose motion ``points`` tell, and the eyes of a pose estimator."""
+    """The clip on a drawn body, through a camera of ``kind`` whose motion ``points`` tell, by a pose estimator."""
+    clip = another_body(clip, settings.bodies, rng)
     frames, joints = clip.points.shape[:2]
     camera = draw_camera(kind, clip.points[:, 0], clip.fps, rng)
     # A mean distance of 1 in a plane is a standard deviation of sqrt(2 / pi) an axis.
