@@ -20,9 +20,9 @@ from egopose.motion.io import read_motion
 from egopose.motion.motion import Motion
 from egopose.motion.retarget import retarget
 from egopose.pipeline.mocap_sources import clips_of
-from egopose.scene.contacts import ContactNetwork, estimate_contacts
+from egopose.scene.contacts import ContactEstimator
 from egopose.scene.root import KinematicRoot, kinematic_root
-from egopose.training.contact_network import ContactSettings, contact_clip, seen_by
+from egopose.training.contact_clips import ContactSettings, contact_clip, seen_by
 
 STEPS = ("14_21", "14_22", "14_23")  # "climb 3 steps", with the root as recorded
 
@@ -77,14 +77,14 @@ def main() -> None:
     values = compose_config("contacts", [f"sources.cmu_people={folder}", "out=unused"])
     settings = from_mapping(ContactSettings, values["training"], "conf/contacts.yaml")
     humanoid = humanoid_of(values)
-    network: ContactNetwork | None = load_contact_network(Path(sys.argv[2])) if len(sys.argv) > 2 else None
+    network: ContactEstimator | None = load_contact_network(Path(sys.argv[2])) if len(sys.argv) > 2 else None
     rows: dict[str, dict[str, dict[str, float]]] = {}
     for place, motion in enumerate(clips_of(values, "conf/contacts.yaml")[1]):
         clip = contact_clip(humanoid, motion, settings)
         cases = {"true contacts": (clip.contacts, 0.0), "true contacts, 30 mm": (clip.contacts, 0.03)}
         if network is not None:
             seen = seen_by(clip, "pan", settings, np.random.default_rng([7, place]))
-            told = estimate_contacts(network, seen.keypoints, seen.confidence, seen.camera) > 0.5
+            told = network.probabilities(seen.keypoints, seen.confidence, seen.camera) > 0.5
             cases |= {"network's contacts": (told, 0.0), "network's contacts, 30 mm": (told, 0.03)}
         for name, (contacts, noise) in cases.items():
             if contacts.any():

@@ -18,6 +18,7 @@ from egopose.vision.video import Frame
 pytest.importorskip("ai_edge_litert", reason="the extra 'poses' is not installed")
 
 from egopose.scene.poses.blazepose import BlazePose
+from egopose.scene.poses.blazepose_networks import Region
 
 PICTURES = Path(__file__).parent / "pictures"
 
@@ -69,6 +70,27 @@ def test_who_is_lost_is_found_again_and_frames_without_anyone_are_unknown(person
     box = track.boxes()
     assert np.isnan(box[1]).all()
     assert (box[0, :2] < track.pixels[0, hips].min(axis=0)).all()
+
+
+def test_a_films_first_frames_are_read_again_from_the_first_sure_one(
+    person: Frame, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    estimator = BlazePose(turns=(0,))
+    look, blind = estimator._look, 3
+
+    def looks_away(frame: Frame, around: Region | None = None) -> list[Region]:
+        nonlocal blind
+        blind -= 1
+        return [] if blind >= 0 else look(frame, around)
+
+    monkeypatch.setattr(estimator, "_look", looks_away)
+    film = [np.roll(person, 3 * t, axis=1) for t in range(5)]
+    track = estimator.estimate(film, 30.0)
+    hips = [BLAZEPOSE_33.index(f"{side}_hip") for side in ("left", "right")]
+    assert track.confidence.mean(axis=1).min() > 0.8
+    np.testing.assert_allclose(
+        track.pixels[:, hips] - track.pixels[:1, hips], [[[3 * t, 0]] * 2 for t in range(5)], atol=4
+    )
 
 
 def test_a_film_without_anyone_or_of_changing_size_is_refused(person: Frame) -> None:

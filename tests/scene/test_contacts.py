@@ -1,122 +1,108 @@
-"""The contact network's windows and vote, and cameras against the pinhole's formula."""
+"""The contact network's inputs, what it sees at a clip's ends, and cameras against the pinhole's formula."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 import torch
+from helpers.seen_legs import legs, mirrored_legs
 from hypothesis import given
 from hypothesis import strategies as st
 
-from egopose.scene.contacts import (
-    INPUTS,
-    LABELS,
-    LOWER_BODY,
-    WINDOW,
-    ContactNetwork,
-    contact_windows,
-    estimate_contacts,
-    labels_of_windows,
-    mirrored_windows,
-    vote,
-)
+from egopose.scene.contacts import FEATURES, ContactNetwork, contact_features, mirrored_features
 from egopose.scene.virtual_camera import KINDS, background_motion, draw_camera, project
 
-
-def keypoints(frames: int = 20, seed: int = 0) -> np.ndarray:
-    random = np.random.default_rng(seed)
-    return random.normal(size=(1, 7, 2)) + 0.05 * random.normal(size=(frames, 7, 2)).cumsum(axis=0)
+SURE = np.ones((20, 7))
 
 
-def test_windows_are_centred_and_scaled() -> None:
-    points = keypoints()
-    windows = contact_windows(points, np.ones((20, 7))).reshape(20, WINDOW, 7, 3)
-    np.testing.assert_allclose(windows[:, WINDOW // 2, 0, :2], 0.0, atol=1e-7)
-    np.testing.assert_allclose(np.abs(windows[..., :2]).max(axis=(1, 2, 3)), 0.8, rtol=1e-6)
-    # Frame 10's window, by hand.
-    by_hand = points[6:15] - points[10, 0]
-    np.testing.assert_allclose(windows[10, ..., :2], 0.8 * by_hand / np.abs(by_hand).max(), rtol=1e-5, atol=1e-7)
-    np.testing.assert_array_equal(windows[0, 0], windows[0, 4])
+def parts(features: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Places and movements ``[T, 7, 2]``."""
+    return features[:, :14].reshape(-1, 7, 2), features[:, 14:28].reshape(-1, 7, 2)
+
+
+def test_places_and_movements_are_in_leg_lengths() -> None:
+    points = legs()
+    features = contact_features(points, 0.5 * SURE)
+    assert features.shape == (20, FEATURES)
+    places, movements = parts(features)
+    np.testing.assert_array_equal(places[:, 0], 0.0)
+    bones = np.linalg.norm(points[:, [2, 3, 5, 6]] - points[:, [1, 2, 4, 5]], axis=-1).reshape(20, 2, 2).sum(axis=2)
+    length = bones.max(axis=1)[3:18].mean()  # of the 15 frames around frame 10
+    np.testing.assert_allclose(places[10], (points[10] - points[10, 0]) / length, rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(movements[10], 10 * (points[11] - points[10]) / length, rtol=1e-5, atol=1e-6)
+    np.testing.assert_array_equal(movements[-1], 0.0)
+    np.testing.assert_array_equal(features[:, 28:], [[0.5] * 7 + [1.0]] * 20)
+    # A joint that jumps across the picture is cut.
+    points[5, 3] += 1e6
+    assert np.abs(parts(contact_features(points, SURE))[1]).max() <= 2.0
 
 
 @given(shift=st.tuples(*[st.floats(-1e3, 1e3)] * 2), scale=st.floats(0.01, 1e3))
 def test_place_and_unit_do_not_matter(shift: tuple[float, float], scale: float) -> None:
-    points, sure = keypoints(12), np.full((12, 7), 0.5)
+    points, sure = legs(12), np.full((12, 7), 0.5)
     np.testing.assert_allclose(
-        contact_windows(points * scale + shift, sure), contact_windows(points, sure), atol=2e-4 / min(scale, 1.0)
+        contact_features(points * scale + shift, sure), contact_features(points, sure), atol=1e-3 / min(scale, 1.0)
     )
 
 
 def test_a_camera_that_is_known_is_undone() -> None:
-    """Pictures moved by similarities give the windows of the still camera, up to the middle frame's own roll."""
-    points, frames = keypoints(30, 3), 30
-    random = np.random.default_rng(1)
-    angle, zoom = 0.02 * random.normal(size=frames).cumsum(), np.exp(0.1 * random.normal(size=frames))
-    move = random.normal(size=(frames, 2)).cumsum(axis=0)
+    """A camera that turns, rolls and zooms gives the movements of the still one, in its own axes and size."""
+    frames = 30
+    points, random = legs(frames, 3), np.random.default_rng(1)
+    angle, zoom = 0.02 * random.normal(size=frames).cumsum(), np.exp(0.03 * random.normal(size=frames).cumsum())
     camera = np.tile(np.eye(3), (frames, 1, 1))
     camera[:, 0, 0] = camera[:, 1, 1] = zoom * np.cos(angle)
     camera[:, 1, 0], camera[:, 0, 1] = zoom * np.sin(angle), -zoom * np.sin(angle)
-    camera[:, :2, 2] = move
+    camera[:, :2, 2] = random.normal(size=(frames, 2)).cumsum(axis=0)
     homogeneous = np.concatenate([points, np.ones((frames, 7, 1))], axis=-1)
     seen = np.einsum("tij,tkj->tki", np.linalg.inv(camera), homogeneous)[..., :2]
     sure = np.ones((frames, 7))
-    undone = contact_windows(seen, sure, camera).reshape(frames, WINDOW, 7, 3)[..., :2]
-    still = contact_windows(points, sure).reshape(frames, WINDOW, 7, 3)[..., :2]
-    # A common roll and the scale to 0.8 are what may differ.
-    one, other = (np.linalg.norm(w, axis=-1) for w in (undone, still))
-    knee = (slice(None), slice(WINDOW // 2, WINDOW // 2 + 1), slice(3, 4))
-    np.testing.assert_allclose(one / one[knee], other / other[knee], rtol=1e-4, atol=1e-6)
-    as_seen = contact_windows(seen, sure).reshape(frames, WINDOW, 7, 3)[..., :2]
-    assert np.abs(as_seen - still).max() > 0.1
+    undone, still, as_seen = (
+        parts(contact_features(p, sure, c)) for p, c in ((seen, camera), (points, None), (seen, None))
+    )
+    # Against the place of a joint in the same frame, size and roll cancel.
+    for t in (0, 10, 20):
+        rows = [np.linalg.norm(m[t], axis=-1) / np.linalg.norm(p[t, 3]) for p, m in (undone, still, as_seen)]
+        np.testing.assert_allclose(rows[0], rows[1], rtol=1e-3)
+        assert np.abs(rows[2] / rows[1] - 1).max() > 0.1
 
 
-def test_unseen_joints_stand_at_the_centre() -> None:
-    points, sure = keypoints(), np.ones((20, 7))
-    points[8, 3], sure[8, 3] = np.nan, 0.0
-    window = contact_windows(points, sure).reshape(20, WINDOW, 7, 3)
-    np.testing.assert_array_equal(window[8, WINDOW // 2, 3], 0.0)
-    assert np.isfinite(window).all()
+def test_unseen_joints_are_interpolated() -> None:
+    points, sure = legs(), SURE.copy()
+    points[8:10, 3], sure[8:10, 3] = np.nan, 0.0
+    features = contact_features(points, sure)
+    between = points.copy()
+    between[8:10, 3] = points[7, 3] + np.array([[1 / 3], [2 / 3]]) * (points[10, 3] - points[7, 3])
+    np.testing.assert_allclose(features[:, :28], contact_features(between, SURE)[:, :28], rtol=1e-5, atol=1e-6)
+    np.testing.assert_array_equal(features[8:10, 31], 0.0)
+    sure[:, 3] = 0.0
+    assert np.isfinite(contact_features(points, sure)).all()
+    assert np.isfinite(contact_features(points, 0 * sure)).all()
     sure[8, 3] = 0.1
     with pytest.raises(ValueError, match="finite"):
-        contact_windows(points, sure)
+        contact_features(points, sure)
     with pytest.raises(ValueError, match=r"T, 7, 2"):
-        contact_windows(points[:, :6], sure)
+        contact_features(points[:, :6], sure)
     with pytest.raises(ValueError, match="camera"):
-        contact_windows(keypoints(), np.ones((20, 7)), np.eye(3))
-
-
-def test_the_vote_gives_back_what_all_windows_agree_on() -> None:
-    contacts = np.random.default_rng(0).random((15, 2)) < 0.5
-    labels = labels_of_windows(contacts)
-    assert labels.shape == (15, LABELS, 2)
-    np.testing.assert_array_equal(vote(labels.astype(float)), contacts)
-    # One window of five that is wrong about a frame does not turn it.
-    wrong = labels.astype(float)
-    wrong[6, 2] = 1 - wrong[6, 2]
-    np.testing.assert_array_equal(vote(wrong) > 0.5, contacts)
-    np.testing.assert_allclose(np.abs(vote(wrong)[6] - contacts[6]), 0.2)
+        contact_features(legs(), SURE, np.eye(3))
 
 
 def test_the_mirror_image_swaps_the_legs() -> None:
-    points, sure = keypoints(), np.random.default_rng(2).random((20, 7)) + 0.1
-    other = [LOWER_BODY.index(swapped(n)) for n in LOWER_BODY]
-    mirrored = contact_windows((points * [-1, 1])[:, other], sure[:, other])
-    torch.testing.assert_close(
-        mirrored_windows(torch.from_numpy(contact_windows(points, sure))), torch.from_numpy(mirrored)
-    )
+    points, sure = legs(), np.random.default_rng(2).random((20, 7)) + 0.1
+    mirrored = torch.from_numpy(contact_features(*mirrored_legs(points, sure)))
+    torch.testing.assert_close(mirrored_features(torch.from_numpy(contact_features(points, sure))), mirrored)
+    torch.testing.assert_close(mirrored_features(mirrored), torch.from_numpy(contact_features(points, sure)))
 
 
-def swapped(name: str) -> str:
-    return name.replace("right", "x").replace("left", "right").replace("x", "left")
-
-
-def test_the_network_is_the_papers() -> None:
-    network = ContactNetwork().eval()
-    sizes = [layer.out_features for layer in network.layers if isinstance(layer, torch.nn.Linear)]
-    assert (INPUTS, sizes) == (189, [1024, 512, 128, 32, 10])
-    told = estimate_contacts(network, keypoints(), np.ones((20, 7)))
-    assert told.shape == (20, 2)
+def test_it_sees_sixteen_frames_to_either_side() -> None:
+    torch.manual_seed(0)
+    network, points, sure = ContactNetwork((32,)).eval(), legs(80), np.ones((80, 7))
+    told = network.probabilities(points, sure)
+    assert told.shape == (80, 2)
     assert ((told > 0) & (told < 1)).all()
+    sure[40] = 0.5  # nothing but frame 40's confidences change
+    other = np.flatnonzero((network.probabilities(points, sure) != told).any(axis=1))
+    assert (other.min(), other.max()) == (24, 56)
 
 
 @pytest.mark.parametrize("kind", KINDS)

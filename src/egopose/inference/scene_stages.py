@@ -25,7 +25,7 @@ from egopose.motion.rotations import Array
 from egopose.scene.articulation import articulated
 from egopose.scene.camera import CameraTrack, camera_motion
 from egopose.scene.camera_file import given_camera, load_camera, save_camera
-from egopose.scene.contacts import FEET, LOWER_BODY, ContactNetwork, estimate_contacts
+from egopose.scene.contacts import FEET, LOWER_BODY, ContactEstimator
 from egopose.scene.footholds import on_footholds
 from egopose.scene.lifting import LiftingNetwork, lifted_track
 from egopose.scene.poses.blazepose import BlazePose
@@ -193,13 +193,13 @@ def camera_moves(folder: Path, scene: Scene) -> str:
     return "fixed" if max(ways, zoom) < _STILL else "zoom" if zoom > 0.1 else "pan"
 
 
-def tell_contacts(values: Mapping[str, Any], network: ContactNetwork, folder: Path, out: Path) -> None:
+def tell_contacts(values: Mapping[str, Any], network: ContactEstimator, folder: Path, out: Path) -> None:
     """``contacts.npz``: the network's probabilities ``[T, 2]`` (right, left) and which feet touch something."""
     track, camera = load_track(folder / "mended.npz").to_schema(BODY_25), clip_camera(folder)
     rows = [BODY_25.index(name) for name in LOWER_BODY]
     pixels = camera.redo(track.pixels)[:, rows]
     confidence = np.where(np.isfinite(pixels).all(axis=-1), track.confidence[:, rows], 0.0)
-    probability = estimate_contacts(network, np.nan_to_num(pixels), confidence, camera.to_first)
+    probability = network.probabilities(np.nan_to_num(pixels), confidence, camera.to_first)
     threshold = convert(values["contacts"]["threshold"], float, _SOURCE, "contacts.threshold")
     shortest = convert(values["contacts"]["shortest"], int, _SOURCE, "contacts.shortest")
     touching = without_short_runs(~without_short_runs(probability <= threshold, shortest), shortest)

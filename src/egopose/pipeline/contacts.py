@@ -12,10 +12,11 @@ from egopose.checkpoint.contacts import save_contact_network
 from egopose.core.config import from_mapping
 from egopose.data.preparation import humanoid_of
 from egopose.pipeline.mocap_sources import clips_of, folder_to_make
+from egopose.training.contact_clips import ContactSettings, contact_clip
 from egopose.training.contact_network import (
-    ContactSettings,
     accuracy_table,
-    contact_clip,
+    draw_views,
+    judging_views,
     overall,
     train_contact_network,
 )
@@ -39,13 +40,13 @@ def train_contacts(values: Mapping[str, Any]) -> None:
     def tell(epoch: int, loss: float, seconds: float) -> None:
         print(f"epoch {epoch} of {settings.epochs}, loss {loss:.4f}, {seconds:.1f} s", file=sys.stderr, flush=True)
 
-    network = train_contact_network(train, settings, tell)
+    network = train_contact_network(draw_views(train, settings), settings, tell)
     save_contact_network(network, asdict(settings), out / "network")
     print(f"network: {out / 'network'}")
     if not test:
         print("no source holds people out: nothing is judged")
         return
-    table = accuracy_table(network, test, settings, _CAMERAS)
+    table = accuracy_table(network, judging_views(test, settings, _CAMERAS))
     frames = {clip.name: len(clip.points) for clip in test}
     (out / "result.json").write_text(json.dumps({"accuracy": table, "frames": frames, "seed": settings.seed}, indent=1))
     for name, row in table.items():

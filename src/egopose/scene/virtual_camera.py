@@ -104,7 +104,9 @@ def project(camera: CameraPath, points: Array) -> tuple[Array, Array]:
     return camera.focal[:, None, None] * seen[..., :2] / safe[..., None], depth
 
 
-def background_motion(camera: CameraPath, centre: Array, rng: np.random.Generator, noise: float = 0.001) -> Array:
+def background_motion(
+    camera: CameraPath, centre: Array, rng: np.random.Generator, count: int = 400, noise: float = 0.001
+) -> Array:
     """What tracking the background tells of a camera's motion: a similarity for each pair of frames, chained.
 
     Points on the floor and on walls 6 to 15 m away are seen in both frames; a similarity is fitted to them. A camera
@@ -114,12 +116,12 @@ def background_motion(camera: CameraPath, centre: Array, rng: np.random.Generato
         camera: see :class:`CameraPath`.
         centre: ``[3]`` of the place, m.
         rng: draws the points and their errors.
+        count: of the points.
         noise: of a point's place in the second picture, in picture heights: 1 pixel of 1,000.
 
     Returns:
         ``[T, 3, 3]``: takes a picture's homogeneous points into the first picture's.
     """
-    count = 400
     around, away = rng.uniform(0, 2 * np.pi, count), rng.uniform(6.0, 15.0, count)
     height = np.where(rng.random(count) < 0.4, 0.0, rng.uniform(0.0, 5.0, count))
     away = np.where(height == 0.0, rng.uniform(0.5, 15.0, count), away)

@@ -22,6 +22,9 @@ _LOOK_EVERY = 10
 _LEAST, _DOUBTFUL = 0.5, 0.8
 #: Mean confidence of a person who was found well.
 _CLEAR = 0.6
+#: A film's first frames that are read again, backwards from the first one that is as sure as this on average: a region
+#: that the detector drew takes some frames to close in on the person.
+_SETTLING, _SETTLED = 10, 0.9
 #: Who was lost is looked for this long (s), this many of them, within this many sides of the region they were in.
 _SEARCH, _SEARCHED, _NEARBY = 1.5, 2, 1.5
 #: A picture smaller than this (px) shows nobody.
@@ -59,6 +62,7 @@ class BlazePose:
         lost: list[tuple[Region, int]] = []
         shape: tuple[int, ...] = ()
         longest = _SEARCH * fps
+        first: list[Frame] = []
         for t, frame in enumerate(frames):
             shape = shape or frame.shape
             if frame.shape != shape or t >= MAX_FRAMES:
@@ -76,6 +80,12 @@ class BlazePose:
                     found += self._read(frame, self._look(frame, region))
             readings.append(found)
             carried = _people(found)
+            if t < _SETTLING:
+                first.append(frame)
+            elif first:
+                self._read_back(first, readings)
+                first = []
+        self._read_back(first, readings)
         if not any(readings):
             raise InputError("poses", "frames", f"no person was found in {len(readings)} frames")
         return _track(readings, fps, (shape[1], shape[0]), self._at)
@@ -84,6 +94,13 @@ class BlazePose:
         """Readings of the regions in which there is a person."""
         found = [self._networks.read(frame, region) for region in _distinct(regions)]
         return [reading for reading in found if reading.score >= _LEAST]
+
+    def _read_back(self, frames: list[Frame], readings: list[list[Reading]]) -> None:
+        """Add readings to those of a film's first frames, from the region that the next frame's are in."""
+        sure = [max((float(one.confidence.mean()) for one in found), default=0.0) for found in readings[: len(frames)]]
+        settled = next((t for t, mean in enumerate(sure) if mean >= _SETTLED), 0)
+        for t in reversed(range(settled)):
+            readings[t] += self._read(frames[t], [one.region for one in _people(readings[t + 1])])
 
     def _look(self, frame: Frame, around: Region | None = None) -> list[Region]:
         """People in the whole picture, or near where one was: upright and in the picture's other turns."""
