@@ -24,7 +24,7 @@ from egopose.scene.clip import read_clip
 from egopose.scene.simulated import SimulatedMotion
 
 FRAMES = 14
-SMALL = {"window": 6, "knots": 6, "advance": 3, "iterations": 1, "threads": 1}
+SMALL = {"window": 12, "knots": 3, "changed": 6, "advance": 3, "iterations": 2, "threads": 1}
 
 
 def settings(**more: Any) -> RefinementSettings:
@@ -106,7 +106,15 @@ def test_knots_make_lines() -> None:
 
 @pytest.mark.parametrize(
     ("name", "value"),
-    [("window", 0), ("advance", 7), ("sweeps", 0), ("difference", 0.0), ("reach", -1.0), ("dampings", [])],
+    [
+        ("window", 0),
+        ("changed", 13),
+        ("advance", 7),
+        ("sweeps", 0),
+        ("difference", 0.0),
+        ("reach", -1.0),
+        ("dampings", []),
+    ],
 )
 def test_a_setting_that_cannot_be_is_named(name: str, value: object) -> None:
     with pytest.raises(InputError, match=name):
