@@ -126,7 +126,7 @@ def seen(motion: Motion, kind: str, noise: SightNoise, rng: np.random.Generator)
     track = PoseTrack(BODY_25, pixels, confidence, motion.fps, SIZE, landmarks)
     told = np.tile(np.eye(3), (frames, 1, 1))
     if kind != "fixed":
-        told = background_motion(camera, motion.qpos[:, :3].mean(axis=0), rng, noise.background)
+        told = background_motion(camera, motion.qpos[:, :3].mean(axis=0), rng, noise=noise.background)
     ahead = camera.axes[0, 2]
     return Sight(track, _in_pixels(told), float(np.arctan2(ahead[1], ahead[0]) - 0.5 * np.pi))
 
