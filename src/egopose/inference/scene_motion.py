@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -144,21 +145,21 @@ def _suits(box: int, tops: Array, headings: Array, sizes: Array, stands: Standin
 
 
 def _changed(box: Box, wanted: Array) -> Box:
-    change, left = np.zeros(4), {}
-    for number, name in enumerate(FREE):
+    change, left = dict.fromkeys(FREE, 0.0), {}
+    for name, value in zip(FREE, wanted.tolist(), strict=True):
         if name in box.free:
             low, high = box.free[name]
-            change[number] = np.clip(wanted[number], low, high)
-            left[name] = (min(low - change[number], 0.0), max(high - change[number], 0.0))
+            change[name] = min(max(value, low), high)
+            left[name] = (min(low - change[name], 0.0), max(high - change[name], 0.0))
     assert box.place is not None
     assert box.height is not None
     assert box.yaw is not None
-    along, across, up, turn = change.tolist()
-    cos, sin = np.cos(box.yaw), np.sin(box.yaw)
-    place = box.place[0] + cos * along - sin * across, box.place[1] + sin * along + cos * across
+    along, across, up, turn = change.values()
+    cos, sin = math.cos(box.yaw), math.sin(box.yaw)
+    x, y = box.place[0] + cos * along - sin * across, box.place[1] + sin * along + cos * across
     return replace(
         box,
-        place=(round(float(place[0]), 4), round(float(place[1]), 4)),
+        place=(round(x, 4), round(y, 4)),
         height=round(max(box.height + up, 0.0), 4),
         yaw=round(box.yaw + turn, 4),
         free=left,
