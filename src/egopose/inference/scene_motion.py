@@ -67,8 +67,8 @@ def recovered(
     body, ground = among_boxes(folder, clip, humanoid)
     states = reference_states(humanoid, body)
     qpos, qvel = states["qpos"].numpy(), states["qvel"].numpy()
-    reference = Reference(qpos, qvel, ground, trust_of(folder), *box_poses(clip.scene))
-    tracker = ReferenceTracker(policy, humanoid, qpos, qvel)
+    reference = Reference(qpos, qvel, trust_of(folder), *box_poses(clip.scene))
+    tracker = ReferenceTracker(policy, humanoid, qpos, qvel, ground)
     refiner = WindowRefiner(humanoid_in(clip.scene, humanoid), tracker, reference, settings)
     costs: list[float] = []
     best, offsets = None, None

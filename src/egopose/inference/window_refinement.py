@@ -114,14 +114,12 @@ class Reference:
 
     Args:
         qpos, qvel: ``[T, nq]``, ``[T, nv]``.
-        ground: ``[T]`` m: the height of what it stands on.
         trust: ``[T]`` how far each frame is to be believed, 0 to 1.
         box_tops, box_headings: ``[K, 3]`` m, ``[K]`` rad.
     """
 
     qpos: Array
     qvel: Array
-    ground: Array
     trust: Array
     box_tops: Array
     box_headings: Array
@@ -161,9 +159,6 @@ class WindowRefiner:
         if len(reference.box_headings):
             tops, headings = np.tile(reference.box_tops, (count, 1, 1)), np.tile(reference.box_headings, (count, 1))
             self._physics.place_boxes(np.arange(count), tops, headings)
-        # The tracker may be told of a reference that is moved; this one is where it should be.
-        self._moves = np.zeros((count, len(reference.qpos), 3))
-        self._ground = np.broadcast_to(reference.ground, (count, len(reference.ground)))
         self._places = self._physics.poses(reference.qpos)["xpos"]
         w, bodies = settings.weights, self._places.shape[1]
         joints = np.ones(self._nu)
@@ -182,11 +177,6 @@ class WindowRefiner:
     def close(self) -> None:
         """Stop the physics."""
         self._physics.close()
-
-    def offsets_of(self, motion: SimulatedMotion) -> Array:
-        """``[T - 1, nu]`` rad: a motion's controls less what the tracker would do in its states."""
-        tracked = [self._targets(t, motion, slice(t, t + 1)) for t in range(len(motion.ctrl))]
-        return motion.ctrl - np.concatenate(tracked)
 
     def cost(self, motion: SimulatedMotion) -> float:
         """Of a motion: the mean over frames of what :meth:`refine` makes small; offsets and the critic left out."""
@@ -270,7 +260,7 @@ class WindowRefiner:
         for step in range(length):
             frame = first + step
             slower = physics.qvel[worlds].copy()
-            ctrl = self._targets(frame, physics, worlds) + offsets[:, step]
+            ctrl = self._tracker.targets(frame, physics.qpos[worlds], physics.qvel[worlds]) + offsets[:, step]
             ctrl = np.clip(ctrl, *self._humanoid.joint_range.T)
             physics.begin_step(ctrl, worlds)
             broken |= physics.end_step(worlds)
@@ -287,7 +277,9 @@ class WindowRefiner:
         residuals = np.concatenate(rows, axis=1)
         cost = (residuals**2).sum(axis=1)
         if first + length < ends:
-            cost = cost + weights.value * self._shortfall(first + length, worlds)
+            cost = cost + weights.value * self._tracker.shortfall(
+                first + length, physics.qpos[worlds], physics.qvel[worlds]
+            )
         cost = np.where(broken | ~np.isfinite(cost), np.inf, cost)
         return _Futures(residuals, cost, np.stack(positions, 1), np.stack(velocities, 1), np.stack(controls, 1))
 
@@ -299,17 +291,6 @@ class WindowRefiner:
         places = self._of_bodies * (self._physics.poses(qpos)["xpos"] - self._places[frame])
         change = self._of_change * ((qvel - before) - (reference.qvel[frame] - reference.qvel[frame - 1]))
         return np.concatenate([trust * state, trust * places.reshape(len(qpos), -1), change], axis=1)
-
-    def _targets(self, frame: int, bodies: BatchedPhysics | SimulatedMotion, rows: slice) -> Array:
-        qpos, qvel = bodies.qpos[rows], bodies.qvel[rows]
-        count = len(qpos)
-        return self._tracker.targets(frame, qpos, qvel, self._moves[:count], self._ground[:count])
-
-    def _shortfall(self, frame: int, worlds: slice) -> Array:
-        physics, count = self._physics, worlds.stop
-        return self._tracker.shortfall(
-            frame, physics.qpos[worlds], physics.qvel[worlds], self._moves[:count], self._ground[:count]
-        )
 
 
 def _lines(length: int, knots: int) -> Array:
