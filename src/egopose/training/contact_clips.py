@@ -41,7 +41,8 @@ class ContactSettings:
         widths, dropout, input_noise: of its layers.
         views: cameras that every clip is seen by; each epoch takes the next.
         epochs, batch, learning_rate, weight_decay: AdamW in one cycle.
-        seed, threads: of all.
+        seed: of weights, cuts, mirror images and order; :func:`draw_views` does not use it.
+        threads: of torch.
     """
 
     cameras: dict[str, float]
