@@ -22,7 +22,7 @@ _PATHS = re.compile(
     r"policy|telemetry|weights|estimator|asf|source)$"
 )
 #: Settings of such a name that are none.
-_OTHERS = {"data.source", "model.context.source", "training.cameras.track"}
+_OTHERS = {"data.source", "model.context.source", "training.cameras.track", "training.network"}
 
 
 @pytest.mark.parametrize("name", _NAMES)
