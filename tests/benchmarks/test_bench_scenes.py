@@ -206,7 +206,7 @@ def test_a_clip_from_end_to_end(short_source: Path, tmp_path: Path, capsys: pyte
     assert by_motion["simulated"]["root_furthest_m"] == pytest.approx(0.0, abs=1e-9)
     assert by_motion["simulated"]["contact_accuracy"] == 1.0
     assert by_motion["kinematic"]["mpjpe_mm"] > row["mpjpe_mm"]
-    assert {mean["motion"] for mean in judged["by_camera"]} == {"kinematic", "simulated"}
+    assert {mean["motion"] for mean in judged["by_camera"]} == {"still", "anchored", "kinematic", "simulated"}
     assert "| simulated | fixed | none |" in tables(judged)
 
 
