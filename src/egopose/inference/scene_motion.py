@@ -22,7 +22,7 @@ from egopose.scene.clip import Clip, box_poses, humanoid_in
 from egopose.scene.footholds import BoxTops, on_footholds
 from egopose.scene.scene_file import FREE, Box, Scene
 from egopose.scene.simulated import SimulatedMotion
-from egopose.scene.standing import Standing, standing
+from egopose.scene.standing import Standing, in_box_axes, standing
 from egopose.scene.supports import touched
 
 
@@ -111,8 +111,7 @@ def fitted(folder: Path, clip: Clip, humanoid: HumanoidModel) -> Scene:
     stands = standing_of(folder, clip, humanoid)
     tops, headings = box_poses(clip.scene)
     changes = [_suits(k, tops, headings, _sizes(clip.scene), stands) for k in range(len(tops))]
-    boxes = [_changed(box, change) for box, change in zip(clip.scene.boxes, changes, strict=False)]
-    return replace(clip.scene, boxes=(*boxes, *clip.scene.boxes[len(boxes) :]))
+    return replace(clip.scene, boxes=tuple(map(_changed, clip.scene.boxes, changes)))
 
 
 def standing_of(folder: Path, clip: Clip, humanoid: HumanoidModel) -> Standing:
@@ -140,8 +139,7 @@ def _suits(box: int, tops: Array, headings: Array, sizes: Array, stands: Standin
     if not len(on):
         return np.zeros(4)
     moves = stands.moves_of_supports(tops[None], headings[None], sizes)[0, on].mean(axis=0)
-    cos, sin = np.cos(headings[box]), np.sin(headings[box])
-    return -np.array([cos * moves[0] + sin * moves[1], cos * moves[1] - sin * moves[0], moves[2], 0.0])
+    return -np.array([*in_box_axes(moves[:2], headings[box]), moves[2], 0.0])
 
 
 def _changed(box: Box, wanted: Array) -> Box:

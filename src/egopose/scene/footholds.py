@@ -20,6 +20,7 @@ from egopose.motion.motion import Motion
 from egopose.motion.rotations import Array
 from egopose.motion.smooth_inverse_kinematics import Smoothness, solve_smooth
 from egopose.scene.root import Support
+from egopose.scene.standing import in_box_axes
 
 _DEEP = 0.002  # m: a corner that is less deep is on the ground
 _BESIDE = 0.03  # m from a box's edge
@@ -65,10 +66,9 @@ class BoxTops:
         A point a little beside a box counts as over it: feet are not placed to the centimetre.
         """
         away = points[..., None, :] - self.tops[:, :2]
-        cos, sin = np.cos(self.headings), np.sin(self.headings)
-        along = np.abs(cos * away[..., 0] + sin * away[..., 1])
-        across = np.abs(cos * away[..., 1] - sin * away[..., 0])
-        over = (along <= 0.5 * self.sizes[:, 0] + _BESIDE) & (across <= 0.5 * self.sizes[:, 1] + _BESIDE)
+        along, across = in_box_axes(away, self.headings)
+        reach = 0.5 * self.sizes + _BESIDE
+        over = (np.abs(along) <= reach[:, 0]) & (np.abs(across) <= reach[:, 1])
         return np.asarray(np.where(over, self.tops[:, 2], 0.0).max(axis=-1, initial=0.0))
 
 
@@ -91,7 +91,7 @@ def on_footholds(
         boxes: that feet pass over or beside; None where their places are not known.
     """
     settings = settings or FootholdSettings()
-    corners, joints, offsets = _soles(humanoid, motion)
+    corners = _soles(humanoid, motion)
     goal, weight = corners.copy(), np.zeros(corners.shape[:3])
     for support in supports:
         span, foot = slice(support.start, support.stop), support.foot
@@ -102,57 +102,73 @@ def on_footholds(
         place = (stands[..., None] * part).sum(axis=0) / stands.sum(axis=0)[:, None]
         goal[span, foot, :, :2], goal[span, foot, :, 2] = place[:, :2], support.height
         weight[span, foot] = settings.stands * stands
-    positions, quats = motion.forward_kinematics()
-    bodies = positions.shape[1]
     lowest = _ground(len(motion), supports)[..., None]
-    qpos = motion.qpos
-    for _ in range(settings.rounds):
-        targets = Targets(
-            point_joint=np.concatenate([joints, np.arange(bodies)]),
-            point_offset=np.concatenate([offsets, np.zeros((bodies, 3))]),
-            positions=np.concatenate([goal.reshape(len(motion), -1, 3), positions], axis=1),
-            position_weight=np.concatenate(
-                [
-                    weight.reshape(len(motion), -1),
-                    settings.body * np.sqrt(trust)[:, None] * np.ones(bodies),
-                ],
-                axis=1,
-            ),
-            frame_joint=np.array([0]),
-            orientations=quats[:, :1],
-            orientation_weight=np.array([settings.turn]),
-        )
-        qpos = solve_smooth(
-            motion.skeleton,
-            qpos,
-            targets,
-            motion.fps,
-            Smoothness(settings.hinges, settings.root),
-            limits=humanoid.joint_range,
-            iterations=settings.iterations,
-        )
+    qpos = _solved(humanoid, motion, motion.qpos, goal, weight, trust, settings)
+    for _ in range(settings.rounds - 1):
         # A point of the sole that has sunk is held where it is, at the ground's height.
-        found = _soles(humanoid, replace(motion, qpos=qpos))[0]
-        ground = lowest if boxes is None else np.maximum(lowest, boxes.heights(found[..., :2]))
-        sunk = (found[..., 2] < ground - _DEEP) | (weight == settings.clear)
-        new = sunk & (weight < settings.clear)
-        goal = np.where(new[..., None], np.stack([*np.moveaxis(found[..., :2], -1, 0), ground + 0 * weight], -1), goal)
-        weight = np.where(new, settings.clear, weight)
+        found = _soles(humanoid, replace(motion, qpos=qpos))
+        ground = np.broadcast_to(lowest, weight.shape)
+        if boxes is not None:
+            ground = np.maximum(ground, boxes.heights(found[..., :2]))
+        sunk = (found[..., 2] < ground - _DEEP) & (weight < settings.clear)
+        raised = np.concatenate([found[..., :2], ground[..., None]], axis=-1)
+        goal, weight = np.where(sunk[..., None], raised, goal), np.where(sunk, settings.clear, weight)
+        qpos = _solved(humanoid, motion, qpos, goal, weight, trust, settings)
     qpos = qpos.copy()
     qpos[:, 3:7] = rot.continuous(qpos[:, 3:7])
     return replace(motion, qpos=qpos)
 
 
-def _soles(humanoid: HumanoidModel, motion: Motion) -> tuple[Array, NDArray[np.intp], Array]:
-    """Corners ``[T, 2, 4, 3]`` m of the right and the left sole, two of the heel first.
+def _solved(
+    humanoid: HumanoidModel,
+    motion: Motion,
+    start: Array,
+    goal: Array,
+    weight: Array,
+    trust: Array,
+    settings: FootholdSettings,
+) -> Array:
+    """``[T, nq]``, solved from ``start``: soles at ``goal [T, 2, 4, 3]`` m, the body near the motion's own."""
+    positions, quats = motion.forward_kinematics()
+    frames, bodies = positions.shape[:2]
+    joints, offsets = (part.reshape(-1, *part.shape[2:]) for part in _corners(humanoid))
+    of_bodies = settings.body * np.sqrt(trust)[:, None] * np.ones(bodies)
+    targets = Targets(
+        point_joint=np.concatenate([joints, np.arange(bodies)]),
+        point_offset=np.concatenate([offsets, np.zeros((bodies, 3))]),
+        positions=np.concatenate([goal.reshape(frames, -1, 3), positions], axis=1),
+        position_weight=np.concatenate([weight.reshape(frames, -1), of_bodies], axis=1),
+        frame_joint=np.array([0]),
+        orientations=quats[:, :1],
+        orientation_weight=np.array([settings.turn]),
+    )
+    return solve_smooth(
+        motion.skeleton,
+        start,
+        targets,
+        motion.fps,
+        Smoothness(settings.hinges, settings.root),
+        limits=humanoid.joint_range,
+        iterations=settings.iterations,
+    )
 
-    Also the joint ``[8]`` and the place ``[8, 3]`` m in its frame of each.
-    """
+
+def _soles(humanoid: HumanoidModel, motion: Motion) -> Array:
+    """Corners ``[T, 2, 4, 3]`` m of the right and the left sole, two of the heel first."""
+    return sole_edges(humanoid, motion).reshape(len(motion), -1, 4, 3)[:, _order(humanoid)]
+
+
+def _corners(humanoid: HumanoidModel) -> tuple[NDArray[np.intp], Array]:
+    """The joint ``[2, 4]`` of each point of :func:`_soles`, and its place ``[2, 4, 3]`` m in the joint's frame."""
     joints, offsets = sole_corners(humanoid)
+    order = _order(humanoid)
+    return joints.reshape(-1, 4)[order], offsets.reshape(-1, 4, 3)[order]
+
+
+def _order(humanoid: HumanoidModel) -> list[int]:
+    """Of the humanoid's feet: the right one, the left one."""
     names = [humanoid.skeleton.names[foot] for foot in humanoid.feet]
-    order = [names.index(name) for name in ("RightFoot", "LeftFoot")]
-    corners = sole_edges(humanoid, motion).reshape(len(motion), len(names), 4, 3)[:, order]
-    return corners, joints.reshape(-1, 4)[order].ravel(), offsets.reshape(-1, 4, 3)[order].reshape(-1, 3)
+    return [names.index(name) for name in ("RightFoot", "LeftFoot")]
 
 
 def _ground(frames: int, supports: Sequence[Support]) -> Array:

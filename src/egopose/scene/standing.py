@@ -70,7 +70,7 @@ class Standing:
             yaw = headings[:, box]
             cos, sin = np.cos(yaw), np.sin(yaw)
             away = self.place[on] - tops[:, box, :2]
-            along, across = cos * away[..., 0] + sin * away[..., 1], cos * away[..., 1] - sin * away[..., 0]
+            along, across = in_box_axes(away, yaw)
             room = np.maximum(0.5 * sizes[box] - _MARGIN, 0.0)
             back = np.clip(along, -room[:, 0], room[:, 0]) - along
             side = np.clip(across, -room[:, 1], room[:, 1]) - across
@@ -79,6 +79,12 @@ class Standing:
 
     def _of_box(self, tops: Array) -> Array:
         return tops[:, np.maximum(self.box, 0)] if tops.shape[1] else np.zeros((len(tops), len(self.box), 3))
+
+
+def in_box_axes(level: Array, headings: Array) -> tuple[Array, Array]:
+    """Level vectors ``[..., 2]`` along and across boxes of ``headings [...]`` rad."""
+    cos, sin = np.cos(headings), np.sin(headings)
+    return cos * level[..., 0] + sin * level[..., 1], cos * level[..., 1] - sin * level[..., 0]
 
 
 def standing(supports: Sequence[Support], boxes: Sequence[int], feet: Array, frames: int, fps: float) -> Standing:
