@@ -1,6 +1,6 @@
-"""Tries settings of the planner on training takes of a run, whose states no regressor had seen.
+"""Tries planners on training takes of a run, whose states no regressor had seen.
 
-    python experiments/planner/trial.py RUN_DIR [--frames 2600] [--only 'three*']
+    python experiments/planner/trial.py RUN_DIR [--frames 1500] [--only 'gauss*']
 
 Whole takes are drawn by ``--seed`` until they have so many frames. Rows are in trial.yaml; each goes to raw/, and those
 that are there are not run again. README.md is written from raw/.
@@ -11,6 +11,7 @@ from __future__ import annotations
 import argparse
 import fnmatch
 import json
+import time
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -25,12 +26,12 @@ from egopose.data.fragments import FragmentLike
 from egopose.evaluation.agents import FragmentResult, evaluate_agent
 from egopose.evaluation.protocols import ContactSettings
 from egopose.inference.failsafe import FailSafeSettings
-from egopose.inference.planner_settings import planner_settings
+from egopose.inference.planners import read_planner
 from egopose.pipeline.agent import Agent, load_agent
 
 HERE = Path(__file__).resolve().parent
 SHORTEST = 90  # frames of a take
-FIGURES = ("E_pose", "E_vel", "A_accl")
+FIGURES = ("E_pose", "E_vel", "A_accl", "E_key", "mpjpe_root_aligned", "mpjpe", "root_drift", "foot_skate")
 
 
 def drawn(fragments: Sequence[FragmentLike], frames: int, seed: int) -> list[FragmentLike]:
@@ -45,47 +46,60 @@ def drawn(fragments: Sequence[FragmentLike], frames: int, seed: int) -> list[Fra
     return out
 
 
-def row(agent: Agent, fragments: Sequence[FragmentLike], changes: dict[str, Any] | None) -> list[FragmentResult]:
-    settings = compose_config("evaluate", ["checkpoint=none"])
-    planner = planner_settings(settings["planner"])
-    assert planner is not None
+def row(agent: Agent, fragments: Sequence[FragmentLike], overrides: Sequence[str]) -> list[FragmentResult]:
+    settings = compose_config("evaluate", ["checkpoint=none", *overrides])
     contact = from_mapping(ContactSettings, settings["contact"], "conf/evaluate.yaml: contact")
     failsafe = from_mapping(FailSafeSettings, settings["failsafe"], "conf/evaluate.yaml: failsafe")
-    names = [str(number) for number in range(len(fragments))]
-    chosen = None if changes is None else replace(planner, **changes)
-    return evaluate_agent(agent, fragments, names, "train", failsafe, contact, int(settings["threads"]), planner=chosen)
+    names, planner = [str(number) for number in range(len(fragments))], read_planner(settings["planner"])
+    return evaluate_agent(
+        agent, fragments, names, "train", failsafe, contact, int(settings["threads"]), planner=planner
+    )
 
 
 def figures(results: Sequence[FragmentResult]) -> dict[str, Any]:
-    mean = {name: float(np.mean([one.scores.figure(name) for one in results])) for name in FIGURES}
+    """Means over takes, of the bodies and of the regressor they follow."""
+
+    def means(of: str) -> dict[str, float]:
+        return {name: float(np.mean([getattr(one, of).figure(name) for one in results])) for name in FIGURES}
+
     estimates = [one.estimate for one in results]
-    counts = {
+    return {
+        "figures": means("scores"),
+        "regressor": means("pose_regression_scores"),
+        "true A_accl": float(np.mean([one.reference_scores.figure("A_accl") for one in results])),
         "resets": sum(one.n_resets for one in estimates),
         "fallen": sum(int(one.fallen.sum()) for one in estimates),
+        "takes": len(results),
+        "frames": sum(len(one.qpos) for one in estimates),
     }
-    return mean | counts | {"takes": len(results), "frames": sum(len(one.qpos) for one in estimates)}
+
+
+def simulated_steps(overrides: Sequence[str]) -> float:
+    """Control steps that a planner simulates for a frame while nobody falls."""
+    planner = compose_config("evaluate", ["checkpoint=none", *overrides])["planner"]
+    if not planner:
+        return 0.0
+    if planner.get("kind") == "gauss_newton":
+        tried = planner["iterations"] * (planner["samples"] + 2 + len(planner["dampings"]))
+        return float(tried * planner["horizon"] / planner["every"])
+    return float(planner["rounds"] * planner["samples"] * planner["horizon"] / planner["every"])
 
 
 def write_table() -> None:
-    lines = [
-        "# Looking ahead: what was tried",
-        "",
-        "*Written by `trial.py` from `raw/`; do not edit.* Training takes drawn by chance, states of regressors that",
-        "have not seen them; the policy is that of `ours-cross-without2-seed0` of [the study](../study/README.md).",
-        "",
-        "```bash",
-        "python experiments/planner/trial.py RUN_DIR",
-        "```",
-        "",
-        "| planner | E_pose | E_vel | A_accl | resets | fallen frames | takes | frames |",
-        "| --- | ---: | ---: | ---: | ---: | ---: | ---: | ---: |",
+    rows = {name: json.loads(path.read_text()) for name in read_yaml(HERE / "trial.yaml", "rows") if (path := raw(name)).is_file()}
+    names = {"mpjpe_root_aligned": "MPJPE, roots aligned", "mpjpe": "MPJPE", "root_drift": "drift", "foot_skate": "foot skate"}
+    table = [
+        "| planner | " + " | ".join(names.get(key, key) for key in FIGURES) + " | resets | fallen | steps a frame | s a frame |",
+        "| --- |" + " ---: |" * (len(FIGURES) + 4),
     ]
-    for name in read_yaml(HERE / "trial.yaml", "rows"):
-        if (path := raw(name)).is_file():
-            d = json.loads(path.read_text())
-            numbers = " | ".join(f"{d[key]:.3f}" for key in FIGURES)
-            lines.append(f"| {name} | {numbers} | {d['resets']} | {d['fallen']} | {d['takes']} | {d['frames']} |")
-    write_text_whole(HERE / "README.md", "\n".join([*lines, ""]))
+    for name, one in rows.items():
+        ratios = " | ".join(f"{one['figures'][key] / one['regressor'][key]:.3f}" for key in FIGURES)
+        share = one["seconds"] / one["frames"]
+        table.append(f"| {name} | {ratios} | {one['resets']} | {one['fallen']} | {one['steps']:.0f} | {share:.3f} |")
+    page = HERE / "README.md"
+    before, rest = page.read_text().split("<!-- table -->")
+    after = rest.split("<!-- end -->")[1]
+    write_text_whole(page, f"{before}<!-- table -->\n" + "\n".join(table) + f"\n<!-- end -->{after}")
 
 
 def raw(name: str) -> Path:
@@ -95,21 +109,22 @@ def raw(name: str) -> Path:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("run", type=Path)
-    parser.add_argument("--frames", type=int, default=2600)
+    parser.add_argument("--frames", type=int, default=1500)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--only", default="*")
     given = parser.parse_args()
     agent = load_agent(given.run, which="latest")
     fragments = drawn(agent.dataset.train, given.frames, given.seed)
     agent = replace(agent, dataset=replace(agent.dataset, train=fragments))
-    for name, changes in read_yaml(HERE / "trial.yaml", "rows").items():
+    for name, overrides in read_yaml(HERE / "trial.yaml", "rows").items():
         if raw(name).is_file() or not fnmatch.fnmatch(name, given.only):
             continue
-        result = figures(row(agent, fragments, changes))
+        begun = time.monotonic()
+        result = figures(row(agent, fragments, overrides))
+        about = {"settings": overrides, "run": given.run.name, "seed": given.seed, "steps": simulated_steps(overrides)}
         raw(name).parent.mkdir(exist_ok=True)
-        write_text_whole(
-            raw(name), json.dumps({"settings": changes, "run": given.run.name, "seed": given.seed, **result}, indent=1)
-        )
+        seconds = round(time.monotonic() - begun, 1)
+        write_text_whole(raw(name), json.dumps({**about, **result, "seconds": seconds}, indent=1) + "\n")
         print(name, result, flush=True)
     write_table()
 

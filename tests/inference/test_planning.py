@@ -31,7 +31,7 @@ from egopose.envs.transforms import StateNormalizer
 from egopose.evaluation.agents import estimate_and_judge
 from egopose.inference.estimator import Estimate, estimate_takes, restart_path
 from egopose.inference.failsafe import FailSafe, FailSafeSettings
-from egopose.inference.planner import Planner
+from egopose.inference.planner import Planner, Tried
 from egopose.inference.planner_settings import PlannerSettings, planner_settings
 from egopose.inference.video import allowed_planner
 
@@ -314,10 +314,11 @@ def tries_of(planner: Planner) -> list[tuple[Tensor, Tensor]]:
     tries: list[tuple[Tensor, Tensor]] = []
     tried = planner._tried
 
-    def spied(now: Any, candidates: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        score, returns, low = tried(now, candidates)
-        tries.append((candidates.clone(), score.clone()))
-        return score, returns, low
+    def spied(now: Any, candidates: Tensor) -> Tried | None:
+        made = tried(now, candidates)
+        assert made is not None
+        tries.append((candidates.clone(), made.score.clone()))
+        return made
 
     planner._tried = spied  # type: ignore[method-assign]
     return tries
@@ -403,10 +404,10 @@ def test_of_any_scores_none_and_the_plan_so_far_come_first_within_the_margin(
     )
     plan, seen, points = some_plan(planner), list[Tensor](), list[Tensor]()
 
-    def scored(now: Any, candidates: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def scored(now: Any, candidates: Tensor) -> Tried:
         seen.append(candidates.clone())
         points.append(torch.rand(candidates.shape[:2], generator=torch.Generator().manual_seed(len(points))))
-        return points[-1], 10 + points[-1], 0 * points[-1]
+        return Tried(candidates, points[-1], 10 + points[-1], 0 * points[-1])
 
     planner._tried = scored  # type: ignore[method-assign]
     planner._look_ahead(base)  # type: ignore[arg-type]
@@ -450,7 +451,7 @@ def test_a_later_round_tries_what_lies_between_and_about_the_best(samples: int, 
     planner = planner_for(2, states_of(true_motion()[0]), samples=samples)
     candidates, score = judged(known, 2, some_plan(planner))
     start = planner._generator.get_state()
-    more = planner._refined(candidates, score)
+    more = planner._refined(Tried(candidates, score, score, score))
     assert more.shape == (samples, *candidates.shape[1:])
     planner._generator.set_state(start)
     drawn = planner._perturbations(max(samples - 15, 0))
@@ -465,7 +466,7 @@ def test_a_later_round_tries_what_lies_between_and_about_the_best(samples: int, 
     # A change of one body's scores is a change of its ways alone.
     score[:, 1] = score[:, 1].flip(0)
     planner._generator.set_state(start)
-    again = planner._refined(candidates, score)
+    again = planner._refined(Tried(candidates, score, score, score))
     assert torch.equal(again[:, 0], more[:, 0])
     assert not torch.equal(again[:, 1], more[:, 1])
 
@@ -655,12 +656,14 @@ def test_the_path_is_chosen_by_and_no_part_of_the_value() -> None:
         candidates = planner._perturbations(planner.settings.samples) if candidates is None else candidates
         assert planner.path is not None
         planner.path.advance(base.frame, base.body_state()["qpos"])
-        found.append(planner._tried(base.state_dict(), candidates))
-    (score, returns, low), (score_along, returns_along, low_along) = found
-    assert torch.equal(returns, returns_along)
-    assert torch.equal(low, low_along)
+        tried = planner._tried(base.state_dict(), candidates)
+        assert tried is not None
+        found.append(tried)
+    without, with_it = found
+    assert torch.equal(without.returns, with_it.returns)
+    assert torch.equal(without.low, with_it.low)
     # By hand, of a candidate: what two terms of weight 2 add at most, and what they add to it.
-    gained = score_along - score
+    gained = with_it.score - without.score
     assert (gained > 0).all()
     assert (gained <= 4.0 * sum(0.99**step for step in range(12)) + 1e-4).all()
     here = frozen(make_env(2))
@@ -716,14 +719,14 @@ def sinking_tries(planner: Planner, lows: list[list[float]]) -> list[Tensor]:
     """Ways tried, a round at a time; the best of each round is its last, better than any before, and ends that low."""
     tried: list[Tensor] = []
 
-    def told(now: Any, candidates: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def told(now: Any, candidates: Tensor) -> Tried:
         number = len(tried)
         tried.append(candidates.clone())
         score = torch.full(candidates.shape[:2], -100.0)
         score[-1] = float(number)
         low = torch.full(candidates.shape[:2], 5.0)
         low[-1] = torch.tensor(lows[min(number, len(lows) - 1)])
-        return score, score, low
+        return Tried(candidates, score, score, low)
 
     planner._tried = told  # type: ignore[method-assign]
     return tried
@@ -759,7 +762,7 @@ def test_what_is_drawn_to_rescue_is_wider_and_by_turns_anew_and_about_the_best()
     # The mean of the four best is the same for all that is drawn about it; that is half as wide as what is drawn anew.
     candidates, score = torch.cat([usual, anew]), torch.full((80, 2), -100.0)
     score[39], score[79] = 0.0, 1.0
-    fixed = planner._refined(candidates, score)[:15]
+    fixed = planner._refined(Tried(candidates, score, score, score))[:15]
     torch.testing.assert_close(about[:6], fixed[:6])
     size = float((about[15:] - about[15:].mean(0)).square().mean().sqrt())
     assert 0.35 < size / spread[1] < 0.65
@@ -769,7 +772,9 @@ def test_the_head_is_as_low_as_a_plain_simulation_ends() -> None:
     followed, base = true_motion()[0], leaning(make_env(2))
     planner = planner_for(2, states_of(followed))
     candidates = planner._perturbations(planner.settings.samples, 3.0)
-    low = planner._tried(base.state_dict(), candidates)[2]
+    tried = planner._tried(base.state_dict(), candidates)
+    assert tried is not None
+    low = tried.low
     env = frozen(make_env(2, followed))
     env.reset()
     here = base_of(env)

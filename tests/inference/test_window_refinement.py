@@ -17,7 +17,7 @@ from egopose.data.reference import reference_states
 from egopose.humanoid.model import HumanoidModel
 from egopose.humanoid.physics import BatchedPhysics
 from egopose.inference.reference_tracker import ReferenceTracker
-from egopose.inference.window_refinement import Reference, RefinementSettings, WindowRefiner, _lines
+from egopose.inference.window_refinement import Reference, RefinementSettings, WindowRefiner
 from egopose.motion.rotations import Array
 from egopose.pipeline.agent import load_policy
 from egopose.scene.clip import read_clip
@@ -92,14 +92,6 @@ def test_threads_change_nothing(humanoid: HumanoidModel, walk: tuple[Array, Arra
         both.append(one.refine(walk[0][0], walk[1][0])[0].qpos)
         one.close()
     np.testing.assert_array_equal(*both)
-
-
-def test_knots_make_lines() -> None:
-    lines = _lines(6, 3)
-    np.testing.assert_allclose(lines[0], [1 / 3, 2 / 3, 1, 2 / 3, 1 / 3, 0])
-    np.testing.assert_allclose(lines[1], [0, 0, 0, 1 / 3, 2 / 3, 1])
-    # Between two knots that are moved alike, nothing bends.
-    np.testing.assert_allclose(lines.sum(axis=0)[2:], 1.0)
 
 
 @pytest.mark.parametrize(

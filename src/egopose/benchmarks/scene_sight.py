@@ -17,9 +17,11 @@ from egopose.scene.camera import CameraTrack
 from egopose.scene.poses.from_motion import motion_keypoints
 from egopose.scene.poses.keypoints import BODY_25
 from egopose.scene.poses.track import PoseTrack
-from egopose.scene.scene_file import Box, CameraNotes, Scene
+from egopose.scene.scene_file import Box, CameraNotes, Contact, Scene
 from egopose.scene.virtual_camera import CameraPath, background_motion, draw_camera, project, slow_noise
 
+#: Frames for which a hand may lift and is still said to hold.
+_LIFTED = 12
 #: px, of the pictures.
 SIZE = (1280, 720)
 #: A point beside a joint: joint and place in its frame (x ahead, y left, z up), m; Winter 2009, figure 4.1, at 1.75 m.
@@ -178,6 +180,8 @@ def _in_pixels(told: Array) -> CameraTrack:
 def guessed_scene(true: Scene, kind: str, turn: float, start: Array, rng: np.random.Generator) -> Scene:
     """A user's first guess: boxes up to 0.2 m off in height and 0.15 m in place, and how the camera moves.
 
+    What hands hold on to is told, up to two frames off; contacts of feet are left to the film.
+
     Args:
         true: the scene.
         kind: of the camera.
@@ -186,7 +190,28 @@ def guessed_scene(true: Scene, kind: str, turn: float, start: Array, rng: np.ran
         rng: of the errors.
     """
     boxes = tuple(_guessed(box, turn, start, rng) for box in true.boxes)
-    return Scene(fps=true.fps, camera=CameraNotes(motion=kind), boxes=boxes)
+    return Scene(fps=true.fps, camera=CameraNotes(motion=kind), boxes=boxes, contacts=_told(true, rng))
+
+
+def _told(true: Scene, rng: np.random.Generator) -> tuple[Contact, ...]:
+    """Contacts of hands as a user sees them: a hand that lifts for a few frames still holds."""
+    found: list[Contact] = []
+    for contact in sorted(true.contacts, key=lambda one: (one.effector, one.touches, one.first)):
+        if not contact.effector.endswith("_hand"):
+            continue
+        before = found[-1] if found else None
+        alike = before is not None and (before.effector, before.touches) == (contact.effector, contact.touches)
+        if before is not None and alike and contact.first - before.last <= _LIFTED:
+            found[-1] = replace(before, last=contact.last)
+        else:
+            found.append(contact)
+    last = max((contact.last for contact in true.contacts), default=0)
+    out = []
+    for contact in found:
+        early, late = rng.integers(-2, 3, 2).tolist()
+        first = min(max(contact.first + early, 0), last)
+        out.append(replace(contact, first=first, last=min(max(contact.last + late, first), last)))
+    return tuple(sorted(out, key=lambda one: (one.first, one.effector)))
 
 
 def _guessed(box: Box, turn: float, start: Array, rng: np.random.Generator) -> Box:

@@ -344,16 +344,17 @@ class EgoPoseEnv(EnvBase):
         stopped = self.physics.step(self._target(tensordict["action"], ALL))
         return TensorDict(self._arrived(stopped, ALL), batch_size=self.batch_size)
 
-    def try_step(self, action: Tensor) -> dict[str, Tensor]:
-        """A trial step under ``action [N, A]``: there is no reward, and no episode ends.
+    def try_step(self, action: Tensor, worlds: slice = ALL) -> dict[str, Tensor]:
+        """A trial step of ``worlds``, a range, under ``action [n, A]``: there is no reward, and no episode ends.
 
         Returns:
             The entries of the bodies' observations.
         """
-        stopped = self.physics.step(self._target(action, ALL))
-        clock, diverged = self._clock(), torch.from_numpy(stopped[:, None])
-        seen = self._observations(_Lazily(self.physics, ALL), clock["frame"].squeeze(-1))
-        return {**clock, **self._no_flags, "diverged": diverged, **seen}
+        stopped = self.physics.step(self._target(action, worlds), worlds)
+        clock, diverged = self._clock(worlds), torch.from_numpy(stopped[:, None])
+        flags = {name: flag[worlds] for name, flag in self._no_flags.items()}
+        seen = self._observations(_Lazily(self.physics, worlds), clock["frame"].squeeze(-1), worlds)
+        return {**clock, **flags, "diverged": diverged, **seen}
 
     def bodies(self, qpos: Array, qvel: Array) -> BodyView:
         """Bodies ``[n]`` at ``qpos [n, nq]`` and ``qvel [n, nv]``, which are in no world."""

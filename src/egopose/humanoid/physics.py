@@ -248,22 +248,23 @@ class BatchedPhysics:
             if kept is not None:
                 kept[worlds] = 0
 
-    def step(self, ctrl: Array) -> NDArray[np.bool_]:
-        """One control step of all worlds.
+    def step(self, ctrl: Array, worlds: slice = ALL) -> NDArray[np.bool_]:
+        """One control step of ``worlds``, a range of them.
 
         Args:
-            ctrl: ``[N, nu]``, held over the substeps.
+            ctrl: ``[n, nu]`` of these worlds, held over the substeps.
+            worlds: none of which is under way.
 
         Returns:
-            ``[N]`` worlds that diverged in it.
+            ``[n]`` which of these worlds diverged in it.
 
         Raises:
             ValueError: another shape.
         """
-        order = self._begin(ctrl, ALL)
+        order = self._begin(ctrl, worlds)
         self._send(order, self.threads - 1)
         self._run(order)
-        return self.end_step()
+        return self.end_step(worlds)
 
     def begin_step(self, ctrl: Array, worlds: slice = ALL) -> None:
         """Have the threads take a control step of ``worlds``, a range of them; :meth:`end_step` waits for it.

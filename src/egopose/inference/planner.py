@@ -15,6 +15,7 @@ it is past. Terms in the world (``heading``, ``path``) hold bodies to the path t
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from types import SimpleNamespace
 
 import numpy as np
@@ -42,6 +43,50 @@ _PARTS = (0.25, 0.5, 0.75)  # of the best candidate, tried in later rounds
 _ELITES = (2, 4, 8)  # candidates whose means are tried
 _NARROWED = 0.5  # of the perturbations' deviation, around the mean of the second of these
 _BROKEN = 1000.0  # lost by a candidate whose physics break: more than any sum of rewards
+
+
+@dataclass(frozen=True)
+class Futures:
+    """What M worlds did in H frames.
+
+    Args:
+        qpos: ``[H, M, nq]`` after each step.
+        qvel: ``[H + 1, M, nv]``, that before the first step too.
+        row: ``[H * M]`` of the target motion.
+        number: ``[H * M]`` steps into the episode.
+        broken: ``[M]`` steps whose physics broke.
+        value: ``[M]`` V of the last state.
+    """
+
+    qpos: Array
+    qvel: Array
+    row: Tensor
+    number: Tensor
+    broken: Tensor
+    value: Tensor
+
+
+@dataclass(frozen=True)
+class Tried:
+    """Candidates ``[K, N, H, nu]`` and, of each ``[K, N]``: ``score``, what the best has most of; ``returns``, rewards in
+    the heading frame alone; ``low``, by how many metres the head ends below its target.
+
+    The first is no perturbation, the second the current plan.
+    """
+
+    candidates: Tensor
+    score: Tensor
+    returns: Tensor
+    low: Tensor
+
+    def joined(self, more: Tried) -> Tried:
+        """These and ``more``."""
+        return Tried(*(torch.cat([mine, theirs]) for mine, theirs in zip(vars(self).values(), vars(more).values(), strict=True)))
+
+    def falls(self, drop: float) -> bool:
+        """Whether a body's best candidate ends more than ``drop`` m too low."""
+        best = self.score.argmax(0)
+        return bool((self.low[best, torch.arange(len(best))] > drop).any())
 
 
 class Planner:
@@ -170,12 +215,13 @@ class Planner:
         candidates[0], candidates[1] = 0.0, plan
         return candidates
 
-    def _refined(self, candidates: Tensor, score: Tensor, wider: float = 1.0) -> Tensor:
-        """``[K, N, H, nu]`` between and around the best of ``candidates``, by their ``score [>= K, N]``.
+    def _refined(self, tried: Tried, wider: float = 1.0) -> Tensor:
+        """``[K, N, H, nu]`` between and around the best of ``tried``.
 
         They are parts of the best one, parts of the way from the current plan to it, and means of the best ones. The
         rest are drawn around such a mean.
         """
+        candidates, score = tried.candidates, tried.score
         best = candidates[
             score.topk(min(max(_ELITES), len(candidates)), dim=0).indices, torch.arange(candidates.shape[1])
         ]
@@ -189,74 +235,90 @@ class Planner:
     @torch.no_grad()
     def _look_ahead(self, base: EgoPoseEnv) -> bool:
         """Plan; whether there was time for a round."""
-        settings, now = self.settings, base.state_dict()
-        candidates = self._candidates()
-        tried = self._tried(now, candidates)
+        now = base.state_dict()
+        tried = self._searched(now)
         if tried is None:
             return False
-        score, returns, low = tried
-        worlds = torch.arange(candidates.shape[1])
-        for number in range(settings.rounds - 1 + settings.recovery_rounds):
-            recovery_rounds = number - (settings.rounds - 1)
-            if recovery_rounds < 0:
-                more = self._refined(candidates, score)
-            elif not (low[score.argmax(0), worlds] > settings.height_drop).any():
+        self._choose(tried)
+        return True
+
+    def _searched(self, now: Mapping[str, Tensor]) -> Tried | None:
+        """What was tried from the bodies' state ``now``; None where there was no time for a round."""
+        tried = self._tried(now, self._candidates())
+        if tried is None:
+            return None
+        for _ in range(self.settings.rounds - 1):
+            more = self._tried(now, self._refined(tried))
+            if more is None:
+                self.plans_cut += 1
+                return tried
+            tried = tried.joined(more)
+        return self._rescued(now, tried)
+
+    def _rescued(self, now: Mapping[str, Tensor], tried: Tried) -> Tried:
+        """``tried``, and rounds of larger perturbations while a body falls: small ones balance it, but catch no fall."""
+        wide = self.settings.wider
+        for number in range(self.settings.recovery_rounds):
+            if not tried.falls(self.settings.height_drop):
                 break
-            else:  # small perturbations balance a body; catching a fall needs larger ones
-                wide = settings.wider
-                more = (
-                    self._refined(candidates, score, wide)
-                    if recovery_rounds % 2
-                    else self._perturbations(settings.samples, wide)
-                )
-            tried = self._tried(now, more)
-            if tried is None:
+            wider = self._refined(tried, wide) if number % 2 else self._perturbations(self.settings.samples, wide)
+            more = self._tried(now, wider)
+            if more is None:
                 self.plans_cut += 1
                 break
-            pairs = zip((candidates, score, returns, low), (more, *tried), strict=True)
-            candidates, score, returns, low = (torch.cat(pair) for pair in pairs)
+            tried = tried.joined(more)
+        return tried
+
+    def _choose(self, tried: Tried) -> None:
+        """Make the best candidate of each body its plan."""
+        settings, candidates, score = self.settings, tried.candidates, tried.score
+        worlds = torch.arange(candidates.shape[1])
         most, change = score.amax(0), (candidates - candidates[1]).square().mean((2, 3))
         best = torch.where(score >= most - settings.tie_tolerance, change, torch.inf).argmin(0)
         # Random search finds small gains in any noise. Following each of them makes the body tremble.
         enough = most - settings.margin
         best = torch.where(score[0] >= enough, 0, torch.where(score[1] >= enough, 1, best))
-        self._returns = returns[best, worlds]
+        self._returns = tried.returns[best, worlds]
         self._plan[:, : settings.horizon] = candidates[best, worlds]
-        return True
 
-    def _tried(self, now: Mapping[str, Tensor], candidates: Tensor) -> tuple[Tensor, Tensor, Tensor] | None:
-        """Simulate ``candidates [K, N, H, nu]`` from the bodies' state ``now``.
+    def _tried(self, now: Mapping[str, Tensor], candidates: Tensor) -> Tried | None:
+        """``candidates [K, N, H, nu]`` from the bodies' state ``now``; None where :attr:`late` came between."""
+        futures = self._simulated(now, candidates)
+        return None if futures is None else self._scored(futures, candidates)
 
-        Returns:
-            Of each candidate ``[K, N]``: all rewards less costs, rewards in the heading frame alone, and by how many
-            metres the head ends below its target. None where :attr:`late` came between.
-        """
-        settings, copies = self.settings, self._base
+    def _simulated(self, now: Mapping[str, Tensor], candidates: Tensor) -> Futures | None:
+        """What ``candidates [K, N, H, nu]``, at most ``samples`` of each body, do from the bodies' state ``now``."""
+        steps, copies = self.settings.horizon, self._base
+        count = candidates.shape[0] * candidates.shape[1]
+        worlds = slice(0, count)
         self._copy(now)
-        seen = Entries(self._env.transform(copies.observe()).items())
-        count, steps = copies.batch_size[0], settings.horizon
+        seen = Entries(self._env.transform(copies.observe(worlds)).items())
         qpos = np.empty((steps, count, copies.physics.model.nq))
         qvel = np.empty((steps + 1, count, copies.physics.model.nv))
-        qvel[0] = copies.physics.qvel
+        qvel[0] = copies.physics.qvel[worlds]
         rows, numbers, broken = [], [], torch.zeros(count)
         for step in range(steps):
             if self.late():
                 return None
             run_parts(self._actor, seen)
-            after = copies.try_step(seen[self._action] + candidates[:, :, step].flatten(0, 1))
-            qpos[step], qvel[step + 1] = copies.physics.qpos, copies.physics.qvel
+            after = copies.try_step(seen[self._action] + candidates[:, :, step].flatten(0, 1), worlds)
+            qpos[step], qvel[step + 1] = copies.physics.qpos[worlds], copies.physics.qvel[worlds]
             rows.append(self._row(after))
             numbers.append(after["episode_step"].squeeze(-1))
             broken += after["diverged"].squeeze(-1)
             seen = self._env.transform._step(seen, Entries(after))
         run_parts(self._critic, seen)
+        return Futures(qpos, qvel, torch.cat(rows), torch.cat(numbers), broken, seen["state_value"].squeeze(-1))
+
+    def _scored(self, futures: Futures, candidates: Tensor) -> Tried:
+        """Score, returns and low heads of ``candidates [K, N, H, nu]``, which did ``futures``."""
         # Nothing of it changes what the candidates do: it is worked out for all steps at once.
-        reward, cost, low = self._judged(qpos, qvel, torch.cat(rows), torch.cat(numbers))
-        kept = settings.discount ** torch.arange(steps)
-        returns = kept @ reward + settings.discount**steps * seen["state_value"].squeeze(-1)
-        score = returns - kept @ cost - _BROKEN * broken
-        score, returns, low = (part.unflatten(0, candidates.shape[:2]) for part in (score, returns, low[-1]))
-        return score, returns, low
+        settings = self.settings
+        reward, cost, low = self._judged(futures.qpos, futures.qvel, futures.row, futures.number)
+        kept = settings.discount ** torch.arange(settings.horizon)
+        returns = kept @ reward + settings.discount**settings.horizon * futures.value
+        score = returns - kept @ cost - _BROKEN * futures.broken
+        return Tried(candidates, *(part.unflatten(0, candidates.shape[:2]) for part in (score, returns, low[-1])))
 
     def _judged(self, qpos: Array, qvel: Array, row: Tensor, number: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Reward in the heading frame, cost, and metres that the head is below its target, ``[H, M]`` float32.

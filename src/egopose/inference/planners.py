@@ -1,4 +1,4 @@
-"""The planners there are, by ``conf/planner``: random shooting, and iterative LQR."""
+"""The planners there are, by ``conf/planner``: random shooting, Gauss-Newton, and iterative LQR."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import TransformedEnv
 
 from egopose.envs.problem import Followed
+from egopose.inference.gauss_newton_planner import GaussNewtonPlanner, GaussNewtonSettings
 from egopose.inference.planner import Planner
 from egopose.inference.planner_settings import PlannerSettings, planner_settings
 from egopose.inference.trajectory_planner import TrajectoryPlanner, TrajectoryPlannerSettings
@@ -23,8 +24,10 @@ def read_planner(values: Mapping[str, Any] | None) -> AnyPlannerSettings | None:
     Raises:
         InputError: a value is missing, unknown or wrong.
     """
-    if values and values.get("kind") == "trajectory":
-        return TrajectoryPlannerSettings.from_config({key: value for key, value in values.items() if key != "kind"})
+    kinds = {"trajectory": TrajectoryPlannerSettings.from_config, "gauss_newton": GaussNewtonSettings.from_config}
+    kind = (values or {}).get("kind")
+    if values and kind in kinds:
+        return kinds[kind]({key: value for key, value in values.items() if key != "kind"})
     return planner_settings(values)
 
 
@@ -42,6 +45,8 @@ def build_planner(
     """
     if isinstance(settings, TrajectoryPlannerSettings):
         return TrajectoryPlanner(env, actor, critic, settings, followed)
+    if isinstance(settings, GaussNewtonSettings):
+        return GaussNewtonPlanner(env, actor, critic, settings, followed)
     return Planner(env, actor, critic, settings, followed)
 
 

@@ -20,6 +20,7 @@ from egopose.motion.rotations import Array
 from egopose.pipeline.agent import Policy
 from egopose.scene.clip import Clip, box_poses, humanoid_in
 from egopose.scene.footholds import BoxTops, on_footholds
+from egopose.scene.handholds import handholds, hands_of, held_places
 from egopose.scene.scene_file import FREE, Box, Scene
 from egopose.scene.simulated import SimulatedMotion
 from egopose.scene.standing import Standing, in_box_axes, standing
@@ -82,7 +83,9 @@ def recovered(
 
 
 def among_boxes(folder: Path, clip: Clip, humanoid: HumanoidModel) -> tuple[Motion, Array]:
-    """The clip's body with its feet on and over the boxes of its scene, and ``[T]`` m the height of what it stands on.
+    """The clip's body among the boxes of its scene, and ``[T]`` m the height of what it stands on.
+
+    Feet are on and over the boxes, and hands hold what the scene's contacts say.
 
     Raises:
         InputError: it stands on nothing.
@@ -90,14 +93,17 @@ def among_boxes(folder: Path, clip: Clip, humanoid: HumanoidModel) -> tuple[Moti
     stands, sizes = standing_of(folder, clip, humanoid), _sizes(clip.scene)
     tops, headings = box_poses(clip.scene)
     ground = stands.ground(tops[None])[0]
-    if not len(tops):
+    held = handholds(clip.scene)
+    if not len(tops) and not held:
         return clip.body, ground
     qpos = clip.body.qpos.copy()
     qpos[:, :3] += stands.moves(tops[None], headings[None], sizes)[0]
     pairs = zip(supports_of(folder), stands.surfaces(tops[None])[0].tolist(), strict=True)
     supports = [replace(support, height=height) for support, height in pairs]
-    boxes = BoxTops(tops, headings, sizes)
-    return on_footholds(humanoid, replace(clip.body, qpos=qpos), supports, trust_of(folder), boxes=boxes), ground
+    boxes, moved, hands = BoxTops(tops, headings, sizes), replace(clip.body, qpos=qpos), hands_of(humanoid)
+    places = held_places(held, hands.points(moved), hands.radius, tops, headings, sizes)
+    holds = tuple(zip(held, places, strict=True))
+    return on_footholds(humanoid, moved, supports, trust_of(folder), boxes=boxes, holds=holds), ground
 
 
 def fitted(folder: Path, clip: Clip, humanoid: HumanoidModel) -> Scene:

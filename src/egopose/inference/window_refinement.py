@@ -18,40 +18,32 @@ import numpy as np
 
 from egopose.core.config import from_mapping
 from egopose.core.errors import InputError
-from egopose.humanoid.derivatives import state_difference
 from egopose.humanoid.model import HumanoidModel
 from egopose.humanoid.physics import BatchedPhysics
+from egopose.inference.gauss_newton import (
+    Distance,
+    DistanceWeights,
+    check_dampings,
+    damped_steps,
+    knot_lines,
+    single_changes,
+)
 from egopose.inference.reference_tracker import ReferenceTracker
 from egopose.motion.rotations import Array
 from egopose.scene.simulated import SimulatedMotion
 
 
 @dataclass(frozen=True)
-class RefinementWeights:
+class RefinementWeights(DistanceWeights):
     """Weights of squares, of each frame.
 
     Args:
-        bodies: 1/m^2, of the mean over bodies of the squared distance.
-        feet: 1/m^2, on top, of each foot's, divided by the number of bodies.
-        turn: 1/rad^2, of the root's turn.
-        joints: 1/rad^2, of each joint.
-        linear, angular: of the root's velocities, s^2/m^2 and s^2/rad^2.
-        rates: s^2/rad^2, of each joint's velocity.
-        acceleration: s^2/rad^2, of the change of each velocity from frame to frame; ten times it of the root's.
         offsets: 1/rad^2, of each offset.
         smooth: 1/rad^2, of each control's change from frame to frame.
         last: factor of a window's last frame, for what comes after it.
         value: cost of what the tracker's critic expects to be lost of the best reward after it.
     """
 
-    bodies: float
-    feet: float
-    turn: float
-    joints: float
-    linear: float
-    angular: float
-    rates: float
-    acceleration: float
     offsets: float
     smooth: float
     last: float
@@ -98,8 +90,7 @@ class RefinementSettings:
         for name in ("difference", "reach"):
             if not getattr(self, name) > 0:
                 raise InputError("refinement", name, "must be positive, rad")
-        if not self.dampings or min(self.dampings) <= 0:
-            raise InputError("refinement", "dampings", "must be positive numbers, at least one")
+        check_dampings("refinement", self.dampings)
 
     @classmethod
     def from_config(cls, values: Mapping[str, Any], source: str = "conf/reconstruct.yaml") -> RefinementSettings:
@@ -160,19 +151,7 @@ class WindowRefiner:
             tops, headings = np.tile(reference.box_tops, (count, 1, 1)), np.tile(reference.box_headings, (count, 1))
             self._physics.place_boxes(np.arange(count), tops, headings)
         self._places = self._physics.poses(reference.qpos)["xpos"]
-        w, bodies = settings.weights, self._places.shape[1]
-        joints = np.ones(self._nu)
-        self._of_state = np.sqrt(
-            np.concatenate(
-                [[0.0] * 3, [w.turn] * 3, w.joints * joints, [w.linear] * 3, [w.angular] * 3, w.rates * joints]
-            )
-        )
-        share = np.full(bodies, w.bodies / bodies)
-        share[list(humanoid.feet)] += w.feet / bodies
-        self._of_bodies = np.sqrt(share)[:, None]
-        faster = np.full(humanoid.mj_model.nv, w.acceleration)
-        faster[:3] *= 10.0
-        self._of_change = np.sqrt(faster)
+        self._distance = Distance(humanoid, settings.weights, self._places.shape[1])
 
     def close(self) -> None:
         """Stop the physics."""
@@ -231,8 +210,8 @@ class WindowRefiner:
     ) -> tuple[_Futures, Array]:
         """The best future of a window, and its offsets ``[L, nu]``."""
         settings = self.settings
-        shape = _lines(len(offsets), settings.knots)[: -(-settings.changed // settings.knots)]
-        alone = settings.difference * np.einsum("kl,ij->kilj", shape, np.eye(self._nu)).reshape(-1, *offsets.shape)
+        shape = knot_lines(len(offsets), settings.knots, min(settings.changed, len(offsets)))
+        alone = single_changes(shape, self._nu, settings.difference)
         alone = np.concatenate([np.zeros((1, *offsets.shape)), alone])
         best = None
         for _ in range(settings.iterations):
@@ -287,16 +266,10 @@ class WindowRefiner:
         """``[n, R]`` weighted differences from ``frame``; ``before [n, nv]`` are the velocities a frame ago."""
         reference, trust = self._reference, np.sqrt(self._reference.trust[frame])
         wanted = np.broadcast_to(reference.qpos[frame], qpos.shape), np.broadcast_to(reference.qvel[frame], qvel.shape)
-        state = self._of_state * state_difference(qpos, qvel, *wanted)
-        places = self._of_bodies * (self._physics.poses(qpos)["xpos"] - self._places[frame])
-        change = self._of_change * ((qvel - before) - (reference.qvel[frame] - reference.qvel[frame - 1]))
-        return np.concatenate([trust * state, trust * places.reshape(len(qpos), -1), change], axis=1)
-
-
-def _lines(length: int, knots: int) -> Array:
-    """``[K, length]``: how far each of K knots counts in each frame: lines between knots, from 0 on."""
-    at = knots * np.arange(1, -(-length // knots) + 1)
-    return np.maximum(0.0, 1.0 - np.abs(at[:, None] - np.arange(1, length + 1)) / knots)
+        state = self._distance.of_state(qpos, qvel, *wanted)
+        places = self._distance.of_bodies(self._physics.poses(qpos)["xpos"], self._places[frame])
+        change = self._distance.of_change((qvel - before) - (reference.qvel[frame] - reference.qvel[frame - 1]))
+        return np.concatenate([trust * state, trust * places, change], axis=1)
 
 
 def _steps(tried: _Futures, settings: RefinementSettings) -> Array:
@@ -305,10 +278,7 @@ def _steps(tried: _Futures, settings: RefinementSettings) -> Array:
         return np.zeros((len(settings.dampings), len(tried.cost) - 1))
     sound = np.isfinite(tried.cost[1:])[:, None]
     slopes = np.where(sound, tried.residuals[1:] - tried.residuals[0], 0.0) / settings.difference
-    values, vectors = np.linalg.eigh(slopes @ slopes.T)
-    along = vectors.T @ (slopes @ tried.residuals[0])
-    steps = [-(vectors @ (along / (values + damping))) for damping in settings.dampings]
-    return np.clip(np.stack(steps), -settings.reach, settings.reach)
+    return damped_steps(slopes, tried.residuals[0], settings.dampings, settings.reach)
 
 
 def _only(futures: _Futures, world: int) -> _Futures:

@@ -1,4 +1,4 @@
-"""Feet that stand do not slide, and no foot sinks: the poses of a film solved again with the soles on their footholds.
+"""Feet that stand do not slide, no foot sinks, hands hold: the poses of a film solved again with soles on footholds.
 
 Lifted poses tremble and stretch, so that feet slide at a metre a second under a root that is in the right place. No
 body can do that. All frames are solved at once for the body's points, soles on their footholds, and smoothness.
@@ -19,6 +19,7 @@ from egopose.motion.inverse_kinematics import Targets
 from egopose.motion.motion import Motion
 from egopose.motion.rotations import Array
 from egopose.motion.smooth_inverse_kinematics import Smoothness, solve_smooth
+from egopose.scene.handholds import Handhold, hands_of
 from egopose.scene.root import Support
 from egopose.scene.standing import in_box_axes
 
@@ -37,6 +38,7 @@ class FootholdSettings:
         lift: m: of a standing foot's heel and ball, one that is this much higher than the other hardly stands.
         hinges, root: what accelerations cost, see :class:`~egopose.motion.smooth_inverse_kinematics.Smoothness`.
         iterations: of the solver.
+        holds: of a hand that holds.
         clear: of a sole's corner that was in the ground, at the ground's height.
         rounds: of the solver; after each but the last, corners in the ground are found.
     """
@@ -48,6 +50,7 @@ class FootholdSettings:
     hinges: float = 0.0007
     root: float = 0.002
     iterations: int = 8
+    holds: float = 0.3
     clear: float = 1.0
     rounds: int = 3
 
@@ -79,6 +82,7 @@ def on_footholds(
     trust: Array,
     settings: FootholdSettings | None = None,
     boxes: BoxTops | None = None,
+    holds: Sequence[tuple[Handhold, Array]] = (),
 ) -> Motion:
     """The motion with its standing soles where they stand and no sole in what is below it, and smooth.
 
@@ -89,6 +93,7 @@ def on_footholds(
         trust: ``[T]`` how far each frame is to be believed, 0 to 1.
         settings: see :class:`FootholdSettings`; None for its own values.
         boxes: that feet pass over or beside; None where their places are not known.
+        holds: of its hands, each with the place ``[3]`` m of the hand's middle.
     """
     settings = settings or FootholdSettings()
     corners = _soles(humanoid, motion)
@@ -102,8 +107,8 @@ def on_footholds(
         place = (stands[..., None] * part).sum(axis=0) / stands.sum(axis=0)[:, None]
         goal[span, foot, :, :2], goal[span, foot, :, 2] = place[:, :2], support.height
         weight[span, foot] = settings.stands * stands
-    lowest = _ground(len(motion), supports)[..., None]
-    qpos = _solved(humanoid, motion, motion.qpos, goal, weight, trust, settings)
+    lowest, held = _ground(len(motion), supports)[..., None], _held(len(motion), holds, settings.holds)
+    qpos = _solved(humanoid, motion, motion.qpos, (goal, weight), held, trust, settings)
     for _ in range(settings.rounds - 1):
         # A point of the sole that has sunk is held where it is, at the ground's height.
         found = _soles(humanoid, replace(motion, qpos=qpos))
@@ -113,7 +118,7 @@ def on_footholds(
         sunk = (found[..., 2] < ground - _DEEP) & (weight < settings.clear)
         raised = np.concatenate([found[..., :2], ground[..., None]], axis=-1)
         goal, weight = np.where(sunk[..., None], raised, goal), np.where(sunk, settings.clear, weight)
-        qpos = _solved(humanoid, motion, qpos, goal, weight, trust, settings)
+        qpos = _solved(humanoid, motion, qpos, (goal, weight), held, trust, settings)
     qpos = qpos.copy()
     qpos[:, 3:7] = rot.continuous(qpos[:, 3:7])
     return replace(motion, qpos=qpos)
@@ -123,21 +128,25 @@ def _solved(
     humanoid: HumanoidModel,
     motion: Motion,
     start: Array,
-    goal: Array,
-    weight: Array,
+    soles: tuple[Array, Array],
+    hands: tuple[Array, Array],
     trust: Array,
     settings: FootholdSettings,
 ) -> Array:
-    """``[T, nq]``, solved from ``start``: soles at ``goal [T, 2, 4, 3]`` m, the body near the motion's own."""
+    """``[T, nq]``, solved from ``start``: soles and hands at their places, the body near the motion's own.
+
+    ``soles`` are places ``[T, 2, 4, 3]`` m and weights ``[T, 2, 4]``, ``hands`` places ``[T, 2, 3]`` and ``[T, 2]``.
+    """
+    (goal, weight), (grip, grip_weight), middles = soles, hands, hands_of(humanoid)
     positions, quats = motion.forward_kinematics()
     frames, bodies = positions.shape[:2]
     joints, offsets = (part.reshape(-1, *part.shape[2:]) for part in _corners(humanoid))
     of_bodies = settings.body * np.sqrt(trust)[:, None] * np.ones(bodies)
     targets = Targets(
-        point_joint=np.concatenate([joints, np.arange(bodies)]),
-        point_offset=np.concatenate([offsets, np.zeros((bodies, 3))]),
-        positions=np.concatenate([goal.reshape(frames, -1, 3), positions], axis=1),
-        position_weight=np.concatenate([weight.reshape(frames, -1), of_bodies], axis=1),
+        point_joint=np.concatenate([joints, middles.joints, np.arange(bodies)]),
+        point_offset=np.concatenate([offsets, middles.offsets, np.zeros((bodies, 3))]),
+        positions=np.concatenate([goal.reshape(frames, -1, 3), grip, positions], axis=1),
+        position_weight=np.concatenate([weight.reshape(frames, -1), grip_weight, of_bodies], axis=1),
         frame_joint=np.array([0]),
         orientations=quats[:, :1],
         orientation_weight=np.array([settings.turn]),
@@ -151,6 +160,14 @@ def _solved(
         limits=humanoid.joint_range,
         iterations=settings.iterations,
     )
+
+
+def _held(frames: int, holds: Sequence[tuple[Handhold, Array]], weight: float) -> tuple[Array, Array]:
+    """Places ``[T, 2, 3]`` m of hands, and weights ``[T, 2]``."""
+    places, weights = np.zeros((frames, 2, 3)), np.zeros((frames, 2))
+    for hold, place in holds:
+        places[hold.start : hold.stop, hold.hand], weights[hold.start : hold.stop, hold.hand] = place, weight
+    return places, weights
 
 
 def _soles(humanoid: HumanoidModel, motion: Motion) -> Array:
