@@ -17,7 +17,7 @@ from egopose.inference.gauss_newton import (
 )
 
 BODIES = 12
-NONE = {name: 0.0 for name in ("bodies", "feet", "turn", "joints", "linear", "angular", "rates", "acceleration")}
+NONE = dict.fromkeys(("bodies", "feet", "turn", "joints", "linear", "angular", "rates", "acceleration"), 0.0)
 
 
 def test_knots_make_lines() -> None:

@@ -162,7 +162,15 @@ def test_nothing_of_the_planned_bodies_is_touched() -> None:
 
 @pytest.mark.parametrize(
     ("name", "value"),
-    [("changed", 9), ("changed", 0), ("iterations", 0), ("difference", 0.0), ("reach", 0.0), ("dampings", []), ("every", 9)],
+    [
+        ("changed", 9),
+        ("changed", 0),
+        ("iterations", 0),
+        ("difference", 0.0),
+        ("reach", 0.0),
+        ("dampings", []),
+        ("every", 9),
+    ],
 )
 def test_settings_out_of_range_are_refused(name: str, value: object) -> None:
     with pytest.raises(InputError) as caught:

@@ -29,9 +29,10 @@ from egopose.envs.problem import Followed, global_frame
 from egopose.envs.starts import Piece
 from egopose.envs.transforms import StateNormalizer
 from egopose.evaluation.agents import estimate_and_judge
+from egopose.inference.candidates import Tried
 from egopose.inference.estimator import Estimate, estimate_takes, restart_path
 from egopose.inference.failsafe import FailSafe, FailSafeSettings
-from egopose.inference.planner import Planner, Tried
+from egopose.inference.planner import Planner
 from egopose.inference.planner_settings import PlannerSettings, planner_settings
 from egopose.inference.video import allowed_planner
 

@@ -11,21 +11,22 @@ import torch
 
 from egopose.benchmarks.raw_replay import RawReplay, StepRecorder
 from egopose.core.config import compose_config
+from egopose.core.errors import InputError
 from egopose.envs.test_time import prepare_for_test
-from egopose.inference.planner import Planner
-from egopose.inference.planner_settings import planner_settings
+from egopose.inference.planners import build_planner, read_planner
 from egopose.pipeline.dataset import motion_dataset
 from egopose.pipeline.environment import build_env
 from egopose.pipeline.networks import build_networks
 
 
 def run(overrides: Sequence[str], rounds: int) -> dict[str, Any]:
-    """Plans of ``conf/planner/ahead.yaml`` for one body, then the same control steps by ``mj_step`` alone.
+    """Plans of ``conf/planner`` for one body, evaluate's default, then the same control steps by ``mj_step`` alone.
 
     On the default clips, with untrained networks: what they cost does not depend on their weights' values.
 
     Args:
-        overrides: of the training configuration (``sim=fast model=paper``); ``planner.KEY=VALUE`` of the planner.
+        overrides: of the training configuration (``sim=fast model=paper``); ``planner=NAME`` and ``planner.KEY=VALUE``
+            are of the planner.
         rounds: of a second of frames each, interleaved; the median counts.
 
     Returns:
@@ -36,10 +37,11 @@ def run(overrides: Sequence[str], rounds: int) -> dict[str, Any]:
     Raises:
         InputError: a setting is unknown or out of range, or is for no planner.
     """
-    ours = [word for word in overrides if word.startswith("planner.")]
+    ours = [word for word in overrides if word.startswith(("planner.", "planner="))]
     config = compose_config("train", ["sim=fast", *(word for word in overrides if word not in ours)])
-    settings = planner_settings(compose_config("evaluate", ["checkpoint=none", *ours])["planner"])
-    assert settings is not None  # the default is a planner, and only its values change here
+    settings = read_planner(compose_config("evaluate", ["checkpoint=none", *ours])["planner"])
+    if settings is None:
+        raise InputError("bench plan", "planner", "none is no planner")
     threads = int(config["collector"]["physics_threads"])
     torch.set_num_threads(1)
     dataset = motion_dataset(config)
@@ -50,7 +52,7 @@ def run(overrides: Sequence[str], rounds: int) -> dict[str, Any]:
     for one in (env, copies):
         prepare_for_test(one, actor, critic)
     env.reset()
-    planner = Planner(copies, actor, critic, settings)
+    planner = build_planner(copies, actor, critic, settings)
     base, physics = env.base_env, copies.base_env.physics
     recorder, replay = StepRecorder(physics), RawReplay(physics)
 
@@ -73,7 +75,7 @@ def run(overrides: Sequence[str], rounds: int) -> dict[str, Any]:
     columns = {"plan_ms": planned, "physics_ms": bare, "ratio": ratios, "cpu_ratio": cpu_ratios}
     return {
         **{name: statistics.median(column[1:]) for name, column in columns.items()},  # the first round warms up
-        "control_steps": settings.rounds * settings.samples * settings.horizon / settings.every,
+        "control_steps": settings.control_steps,
         "substeps": physics.substeps,
         "threads": threads,
         "rounds": rounds,

@@ -1,8 +1,9 @@
 """What planners by Gauss-Newton share: offsets that are lines between knots, distances, and damped steps.
 
-A window of frames is simulated with the policy in the loop, once as it is and once for each knot of each joint's offset.
-The differences are derivatives of all distances from the motion that is followed. The policy reacts to what offsets do,
-so bodies stay up and distances change smoothly: without it a contact that comes a frame later made derivatives useless.
+A window of frames is simulated with the policy in the loop: once as it is, and once for each knot of each joint's
+offset. The differences are derivatives of all distances from the motion that is followed. The policy reacts to what
+offsets do, so bodies stay up and distances change smoothly. Without it a contact that comes a frame later made
+derivatives useless.
 """
 
 from __future__ import annotations
@@ -86,7 +87,7 @@ def knot_lines(length: int, spacing: int, changed: int) -> Array:
 
 
 def single_changes(lines: Array, size: int, difference: float) -> Array:
-    """``[K * size, length, size]``: each of ``lines [K, length]`` in each of ``size`` joints, ``difference`` rad high."""
+    """``[K * size, length, size]``: each of ``lines [K, length]`` in each of ``size`` joints, ``difference`` rad."""
     return difference * np.einsum("kl,ij->kilj", lines, np.eye(size)).reshape(-1, lines.shape[1], size)
 
 

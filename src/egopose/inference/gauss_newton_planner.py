@@ -1,9 +1,10 @@
 """Looking ahead by Gauss-Newton: the policy's own future, brought nearer to the motion that is followed.
 
-Random shooting (:mod:`egopose.inference.planner`) finds what keeps a body up, but chance seldom finds what brings all of
-its joints nearer. Here the perturbation at each knot of each joint is tried alone, which gives the derivatives of all
-distances from the target motion (:mod:`egopose.inference.gauss_newton`). Several steps are tried side by side, beside
-the plan so far and no perturbation, and the best one is taken. A body that falls in it gets rounds of random shooting.
+Random shooting (:mod:`egopose.inference.planner`) finds what keeps a body up, but chance seldom finds what brings all
+of its joints nearer. Here the perturbation at each knot of each joint is tried alone, which gives the derivatives of
+all distances from the target motion (:mod:`egopose.inference.gauss_newton`). Several steps are tried side by side,
+beside the plan so far and no perturbation, and the best one is taken. A body that falls in it gets rounds of random
+shooting.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ from egopose.core.config import from_mapping
 from egopose.core.errors import InputError
 from egopose.envs.env import EgoPoseEnv
 from egopose.envs.problem import Followed
+from egopose.inference.candidates import Futures, Tried
 from egopose.inference.gauss_newton import (
     Distance,
     DistanceWeights,
@@ -30,7 +32,7 @@ from egopose.inference.gauss_newton import (
     knot_lines,
     single_changes,
 )
-from egopose.inference.planner import Futures, Planner, Tried
+from egopose.inference.planner import Planner
 from egopose.inference.planner_settings import PlannerSettings
 from egopose.models.pose_regression import state_to_qpos
 from egopose.motion import rotations as rot
@@ -76,6 +78,12 @@ class GaussNewtonSettings(PlannerSettings):
     dampings: tuple[float, ...]
     weights: PlanWeights
 
+    @property
+    def control_steps(self) -> float:
+        """Simulated for a frame of each body while none falls."""
+        tried = self.samples + 2 + len(self.dampings)
+        return self.iterations * tried * self.horizon / self.every
+
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.iterations < 1:
@@ -115,7 +123,10 @@ class GaussNewtonPlanner(Planner):
         super().__init__(env, actor, critic, settings, followed)
         if self.path is None:
             raise InputError("planner", "path", "the target motion has no path: planner=ahead")
-        humanoid, lines = self._base.problem.humanoid, knot_lines(settings.horizon, settings.knot_spacing, settings.changed)
+        humanoid, lines = (
+            self._base.problem.humanoid,
+            knot_lines(settings.horizon, settings.knot_spacing, settings.changed),
+        )
         hinges = humanoid.mj_model.nu
         if settings.samples != 1 + len(lines) * hinges:
             raise InputError(
@@ -196,7 +207,9 @@ class GaussNewtonPlanner(Planner):
         bodies = self._base.physics.poses(futures.qpos.reshape(-1, futures.qpos.shape[-1]))["xpos"]
         apart = np.concatenate(
             [
-                self._distance.of_state(*now, *(np.broadcast_to(w, n.shape) for w, n in zip(wanted, now, strict=False))),
+                self._distance.of_state(
+                    *now, *(np.broadcast_to(w, n.shape) for w, n in zip(wanted, now, strict=False))
+                ),
                 self._distance.of_bodies(bodies.reshape(*shape, *bodies.shape[1:]), wanted[2]),
                 self._distance.of_change(np.diff(futures.qvel, axis=0)).reshape(*shape, -1),
             ],

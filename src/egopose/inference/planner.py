@@ -15,7 +15,6 @@ it is past. Terms in the world (``heading``, ``path``) hold bodies to the path t
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from types import SimpleNamespace
 
 import numpy as np
@@ -32,6 +31,7 @@ from egopose.envs.mdp.rewards import build_reward
 from egopose.envs.mdp.step_view import StepView
 from egopose.envs.problem import Followed
 from egopose.humanoid.physics import PER_WORLD, Array
+from egopose.inference.candidates import Futures, Tried
 from egopose.inference.followed_path import FollowedPath
 from egopose.inference.planner_settings import PlannerSettings
 from egopose.models.pose_regression import state_to_qpos
@@ -43,50 +43,6 @@ _PARTS = (0.25, 0.5, 0.75)  # of the best candidate, tried in later rounds
 _ELITES = (2, 4, 8)  # candidates whose means are tried
 _NARROWED = 0.5  # of the perturbations' deviation, around the mean of the second of these
 _BROKEN = 1000.0  # lost by a candidate whose physics break: more than any sum of rewards
-
-
-@dataclass(frozen=True)
-class Futures:
-    """What M worlds did in H frames.
-
-    Args:
-        qpos: ``[H, M, nq]`` after each step.
-        qvel: ``[H + 1, M, nv]``, that before the first step too.
-        row: ``[H * M]`` of the target motion.
-        number: ``[H * M]`` steps into the episode.
-        broken: ``[M]`` steps whose physics broke.
-        value: ``[M]`` V of the last state.
-    """
-
-    qpos: Array
-    qvel: Array
-    row: Tensor
-    number: Tensor
-    broken: Tensor
-    value: Tensor
-
-
-@dataclass(frozen=True)
-class Tried:
-    """Candidates ``[K, N, H, nu]`` and, of each ``[K, N]``: ``score``, what the best has most of; ``returns``, rewards in
-    the heading frame alone; ``low``, by how many metres the head ends below its target.
-
-    The first is no perturbation, the second the current plan.
-    """
-
-    candidates: Tensor
-    score: Tensor
-    returns: Tensor
-    low: Tensor
-
-    def joined(self, more: Tried) -> Tried:
-        """These and ``more``."""
-        return Tried(*(torch.cat([mine, theirs]) for mine, theirs in zip(vars(self).values(), vars(more).values(), strict=True)))
-
-    def falls(self, drop: float) -> bool:
-        """Whether a body's best candidate ends more than ``drop`` m too low."""
-        best = self.score.argmax(0)
-        return bool((self.low[best, torch.arange(len(best))] > drop).any())
 
 
 class Planner:
@@ -256,7 +212,7 @@ class Planner:
         return self._rescued(now, tried)
 
     def _rescued(self, now: Mapping[str, Tensor], tried: Tried) -> Tried:
-        """``tried``, and rounds of larger perturbations while a body falls: small ones balance it, but catch no fall."""
+        """``tried``, and more rounds while a body falls, of larger perturbations: small ones catch no fall."""
         wide = self.settings.wider
         for number in range(self.settings.recovery_rounds):
             if not tried.falls(self.settings.height_drop):

@@ -67,6 +67,11 @@ class PlannerSettings:
     reward: Any
     seed: int
 
+    @property
+    def control_steps(self) -> float:
+        """Simulated for a frame of each body while none falls."""
+        return self.rounds * self.samples * self.horizon / self.every
+
     def __post_init__(self) -> None:
         def check(ok: bool, name: str, cause: str) -> None:
             if not ok:

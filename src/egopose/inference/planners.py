@@ -24,10 +24,12 @@ def read_planner(values: Mapping[str, Any] | None) -> AnyPlannerSettings | None:
     Raises:
         InputError: a value is missing, unknown or wrong.
     """
-    kinds = {"trajectory": TrajectoryPlannerSettings.from_config, "gauss_newton": GaussNewtonSettings.from_config}
-    kind = (values or {}).get("kind")
-    if values and kind in kinds:
-        return kinds[kind]({key: value for key, value in values.items() if key != "kind"})
+    own = {key: value for key, value in (values or {}).items() if key != "kind"}
+    match (values or {}).get("kind"):
+        case "trajectory":
+            return TrajectoryPlannerSettings.from_config(own)
+        case "gauss_newton":
+            return GaussNewtonSettings.from_config(own)
     return planner_settings(values)
 
 

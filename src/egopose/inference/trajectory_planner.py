@@ -33,6 +33,7 @@ from egopose.models.pose_regression import state_to_qpos
 
 _EPISODE = ("take", "start", "stop", "frame")
 _ROWS = ("placed", "laid", *(f"physics.{name}" for name in PER_WORLD))
+_VELOCITIES, _HINGES = 58, 52  # of the humanoid
 _SIMULATED = 512  # worlds that are stepped together
 
 
@@ -72,6 +73,12 @@ class TrajectoryPlannerSettings:
     def samples(self) -> int:
         """Copies of each body that its planner simulates with the policy."""
         return 1
+
+    @property
+    def control_steps(self) -> float:
+        """Simulated for a frame of each body: two nominal futures, the derivatives of one, and the line search."""
+        derivatives = 2 * _VELOCITIES + _HINGES
+        return (2 + derivatives + len(self.steps)) * self.horizon / self.every
 
     @classmethod
     def from_config(cls, values: Mapping[str, Any]) -> TrajectoryPlannerSettings:
