@@ -28,7 +28,7 @@ from egopose.evaluation.agents import evaluate_agent
 from egopose.evaluation.baseline_scores import score_motions
 from egopose.evaluation.protocols import ContactSettings, fragment_names, raw_figures
 from egopose.inference.failsafe import FailSafeSettings
-from egopose.inference.planner_settings import planner_settings
+from egopose.inference.planners import read_planner
 from egopose.models.baselines.path_pose import PathPose
 from egopose.pipeline.agent import load_agent
 from egopose.pipeline.baselines import load_baseline, path_pose_motion
@@ -77,7 +77,7 @@ def judge(run: Path, config: Mapping[str, Any], corruption: Mapping[str, Any]) -
     fragments = list(agent.dataset.test)
     labels = _labels(agent.config, fragments)
     failsafe = from_mapping(FailSafeSettings, settings["failsafe"], "conf/evaluate.yaml: failsafe")
-    planner, threads = planner_settings(planner_of(config)), int(settings["threads"])
+    planner, threads = read_planner(planner_of(config)), int(settings["threads"])
     result = evaluate_agent(agent, fragments, labels, "test", failsafe, contact, threads, planner=planner)
     return {
         method_of(config): raw_figures([one.scores for one in result]),

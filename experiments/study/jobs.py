@@ -26,7 +26,7 @@ from egopose.inference.context_states import context_states
 from egopose.inference.failsafe import FailSafeSettings
 from egopose.inference.forecast_contexts import past_states
 from egopose.inference.forecast_start import begin_forecasts
-from egopose.inference.planner_settings import planner_settings
+from egopose.inference.planners import read_planner
 from egopose.models.baselines.path_pose import PathPose
 from egopose.models.baselines.recurrent import RecurrentForecaster
 from egopose.motion.rotations import Array
@@ -125,7 +125,7 @@ def _estimates(
         fragments = list(agent.dataset.test)
         labels = _labels(judged, fragments)
         failsafe = from_mapping(FailSafeSettings, settings["failsafe"], "conf/evaluate.yaml: failsafe")
-        planner = planner_settings(settings.get("planner"))
+        planner = read_planner(settings.get("planner"))
         threads = int(settings["threads"])
         lookahead = int(settings["lookahead"]) if settings["causal"] else None
         result = evaluate_agent(agent, fragments, labels, "test", failsafe, contact, threads, None, planner, lookahead)
@@ -172,7 +172,7 @@ def _forecasts(
         # As the baselines: what the run's own state regressor sees in the contexts alone.
         pasts = past_states(agent, windows, "regressor")
         states = begin_forecasts(agent, windows, pasts)
-        planner = planner_settings(settings.get("planner"))
+        planner = read_planner(settings.get("planner"))
         futures = forecast_windows_of(agent, windows, states, 1, forecast, int(settings["threads"]), planner).qpos
     else:
         dataset = _material(folder, config, judged)

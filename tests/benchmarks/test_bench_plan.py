@@ -10,7 +10,14 @@ import pytest
 from egopose import bench
 from egopose.benchmarks.raw_replay import RawReplay
 
-SMALL = ["planner.samples=3", "planner.rounds=2", "planner.horizon=4", "planner.every=4", "planner.recovery_rounds=0"]
+SMALL = [
+    "planner=ahead",
+    "planner.samples=3",
+    "planner.rounds=2",
+    "planner.horizon=4",
+    "planner.every=4",
+    "planner.recovery_rounds=0",
+]
 
 
 def test_a_plan_is_timed_beside_the_control_steps_it_took(

@@ -62,7 +62,11 @@ def test_a_policy_that_looks_ahead_is_told_of_the_look_ahead_without_a_planner(t
 
 @pytest.mark.parametrize(
     ("planner", "restart", "named"),
-    [("trajectory", "own", "planner=live"), ("none", "path", "failsafe: restart")],
+    [
+        ("trajectory", "own", "planner=live"),
+        ("gauss_newton", "own", "planner=live"),
+        ("none", "path", "failsafe: restart"),
+    ],
 )
 def test_what_a_stream_lacks_is_refused(planner: str, restart: str, named: str) -> None:
     settings = read_planner(compose_config("evaluate", ["checkpoint=none", f"planner={planner}"]).get("planner"))

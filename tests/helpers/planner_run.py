@@ -22,6 +22,6 @@ SMALL = {
 
 def settings(**changed: Any) -> PlannerSettings:
     """``conf/planner/ahead.yaml`` but for what is given."""
-    made = planner_settings({**compose_config("evaluate", ["checkpoint=none"])["planner"], **changed})
+    made = planner_settings({**compose_config("evaluate", ["checkpoint=none", "planner=ahead"])["planner"], **changed})
     assert made is not None
     return made

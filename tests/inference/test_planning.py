@@ -32,6 +32,7 @@ from egopose.evaluation.agents import estimate_and_judge
 from egopose.inference.candidates import Tried
 from egopose.inference.estimator import Estimate, estimate_takes, restart_path
 from egopose.inference.failsafe import FailSafe, FailSafeSettings
+from egopose.inference.gauss_newton_planner import GaussNewtonSettings
 from egopose.inference.planner import Planner
 from egopose.inference.planner_settings import PlannerSettings, planner_settings
 from egopose.inference.video import allowed_planner
@@ -585,7 +586,9 @@ def test_an_evaluation_has_the_same_threads_whatever_the_process_did_before(befo
 
 def test_estimates_plan_unless_they_are_causal_or_told_not_to() -> None:
     chosen = compose_config("estimate", ["video=none", "checkpoint=none"])
-    assert allowed_planner(chosen) == settings(reward=group("reward", "estimation_path"))
+    assert isinstance(allowed_planner(chosen), GaussNewtonSettings)
+    along = compose_config("estimate", ["video=none", "checkpoint=none", "planner=ahead_path"])
+    assert allowed_planner(along) == settings(reward=group("reward", "estimation_path"))
     assert allowed_planner({**chosen, "causal": True}) is None
     assert allowed_planner({**chosen, "planner": None}) is None
     with pytest.raises(InputError, match="samples"):  # a wrong setting is told even where it is not used

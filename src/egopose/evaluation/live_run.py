@@ -52,7 +52,7 @@ def live_estimates(
     Raises:
         InputError: a planner or a restart that a stream does not have.
     """
-    if planner is not None and not isinstance(planner, PlannerSettings):
+    if planner is not None and type(planner) is not PlannerSettings:  # a stream has no other planner's way of searching
         raise InputError("conf/evaluate.yaml", "planner", "causal=true plans as a stream does: planner=live or none")
     if failsafe.restart != "own":
         raise InputError("failsafe", "restart", "causal=true restarts at the body's own place, as a stream: own")
