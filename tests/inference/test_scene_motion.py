@@ -17,6 +17,7 @@ from egopose.inference import scene_motion
 from egopose.inference.scene_motion import among_boxes, fitted
 from egopose.motion.contacts import runs_of
 from egopose.scene.clip import Clip, read_clip
+from egopose.scene.handholds import hands_of
 from egopose.scene.root import Support
 from egopose.scene.scene_file import Box, Contact, Scene, read_scene, write_scene
 
@@ -64,3 +65,18 @@ def test_the_body_stands_on_the_boxes_of_its_scene(tmp_path: Path, walk: Clip, h
     lowest = sole_edges(humanoid, body)[..., 2].min(axis=1)
     assert lowest.min() > 0.08
     np.testing.assert_allclose(body.qpos[:, 2].mean(), walk.body.qpos[:, 2].mean() + 0.1, atol=0.03)
+
+
+def test_a_hand_that_leans_on_a_box_comes_nearer_to_it(tmp_path: Path, walk: Clip, humanoid: HumanoidModel) -> None:
+    hands = hands_of(humanoid)
+    where = hands.points(walk.body)[8:16, 1].mean(axis=0)
+    table = Box("table", (0.6, 0.6), (float(where[0]), float(where[1])), float(where[2]) - 0.15, 0.0, {})
+    scene = replace(walk.scene, boxes=(replace(STAGE, height=0.0), table))
+    leans = replace(scene, contacts=(*scene.contacts, Contact("left_hand", "table", 8, 15)))
+    over = [
+        hands.points(among_boxes(tmp_path, replace(walk, scene=one), humanoid)[0])[10:14, 1, 2] - table.height
+        for one in (scene, leans)
+    ]
+    assert over[0].min() > 0.1
+    assert (over[1] < over[0] - 0.02).all()
+    assert (over[1] > hands.radius).all()

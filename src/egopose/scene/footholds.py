@@ -38,7 +38,7 @@ class FootholdSettings:
         lift: m: of a standing foot's heel and ball, one that is this much higher than the other hardly stands.
         hinges, root: what accelerations cost, see :class:`~egopose.motion.smooth_inverse_kinematics.Smoothness`.
         iterations: of the solver.
-        holds: of a hand that holds.
+        holds: of a hand that holds; as much as the poses themselves, which are a decimetre off there.
         clear: of a sole's corner that was in the ground, at the ground's height.
         rounds: of the solver; after each but the last, corners in the ground are found.
     """
