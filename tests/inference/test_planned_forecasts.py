@@ -26,6 +26,7 @@ from egopose.envs.mdp.step_view import StepView
 from egopose.envs.reference_forecasts import ReferenceForecasts
 from egopose.envs.target_motion import CurveMotion
 from egopose.envs.test_time import prepare_for_test
+from egopose.evaluation import forecast_run
 from egopose.evaluation import forecast_run as forecast_evaluation
 from egopose.evaluation.forecast_run import ForecastSettings, forecast_windows_of
 from egopose.humanoid.state_layout import StateLayout
@@ -267,6 +268,14 @@ def test_each_lot_of_windows_has_a_planner_that_follows_its_curves(agent: Agent,
     planner.close()
     assert np.abs(told.qpos - windows_by(agent, None, num_envs=2).qpos).max() > 1e-3
     assert len(made) == 2
+
+
+def test_a_lot_has_no_more_copies_than_memory_allows(
+    agent: Agent, made: list[Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(forecast_run, "_PLANNED_TOGETHER", 2 * SMALL["samples"])
+    windows_by(agent, settings(**SMALL))
+    assert [len(one.value) for one in made] == [2, 1]
 
 
 def test_without_settings_there_is_no_planner_and_lots_change_nothing(agent: Agent, made: list[Any]) -> None:

@@ -40,6 +40,8 @@ from egopose.tasks.task import task_of
 
 OURS, DRAWN, STILL = "ours", "ours, drawn", "standing still"
 
+_PLANNED_TOGETHER = 4096  # copies of bodies: what they do takes 30 kB each
+
 
 @dataclass(frozen=True)
 class ForecastSettings:
@@ -224,6 +226,8 @@ def forecast_windows_of(
     planner's ways begin without a memory.
     """
     parts, together = [], max(1, settings.num_envs // samples)
+    if planner is not None:
+        together = min(together, max(1, _PLANNED_TOGETHER // planner.samples))
     for at in range(0, len(windows), together):
         part = windows[at : at + together]
         options = {"threads": threads, "whole_fragments": True, "falls_end": False}
