@@ -28,7 +28,7 @@ from egopose.pipeline.baselines import (
     regressed_motion,
     run_baseline_job,
 )
-from egopose.pipeline.dataset import load_dataset
+from egopose.pipeline.dataset import load_dataset, run_dataset
 from egopose.pipeline.run import build_run
 from egopose.training.loop import train
 
@@ -91,6 +91,10 @@ def test_a_forecaster_is_trained_goes_on_and_forecasts_from_where_it_stands(
         run_baseline_job({**short, "seed": 8}, parted)
 
     dataset = load_dataset(small, progress=False)
+    # A baseline's run is judged on its own dataset, although its configuration names no task.
+    own = run_dataset(configured(small, "erd_fast", 600), whole, progress=False)
+    assert own.test == dataset.test
+    assert torch.equal(own.states, dataset.states)
     model = load_baseline(whole).model
     assert isinstance(model, RecurrentForecaster)
     windows = forecast_windows(dataset.test, 6, 9, 5)

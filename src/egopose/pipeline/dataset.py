@@ -83,7 +83,8 @@ def run_dataset(config: Mapping[str, Any], run: Path, same_store: bool = True, p
     """The dataset of a trained run, with the run's own state regressor ``run/regressor``; nothing is trained.
 
     Args:
-        config: the run's, resolved. Its data is prepared where that has not been done yet.
+        config: the run's, resolved. Its data is prepared where that has not been done yet. A baseline's names no task:
+            its dataset is what the regressor sees.
         run: the run directory.
         same_store: whether the data must be what the run was trained on; False for data of another set.
         progress: show bars.
@@ -94,7 +95,8 @@ def run_dataset(config: Mapping[str, Any], run: Path, same_store: bool = True, p
     if same_store and (run / PROVENANCE).is_file():
         # Checked before anything is prepared, since preparing can take hours.
         require_same_store(run, fingerprint_of(config))
-    return task_of(config).dataset(config, PreparedData(config, run, progress))
+    prepared = PreparedData(config, run, progress)
+    return task_of(config).dataset(config, prepared) if "task" in config else prepared.seen_motions()
 
 
 def _with_tables(config: Mapping[str, Any], store: TakeStore, tables: TensorDictBase, weights: Path) -> Dataset:
