@@ -20,6 +20,17 @@ SMALL = [
 ]
 
 
+def test_steps_of_some_worlds_count_as_many(capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch) -> None:
+    replayed: list[int] = []
+    monkeypatch.setattr(RawReplay, "run", lambda self, states, ctrls: replayed.append(sum(map(len, states))) or 1.0)
+    words = ["planner=gauss_newton", "planner.samples=53", "planner.changed=3", "planner.horizon=4"]
+    words += ["planner.every=4", "planner.recovery_rounds=0", "planner.dampings=[1,10]"]
+    bench.main(["plan", "--json", "--rounds", "1", *words])
+    # Derivatives of 52 hinges and the plan itself, then two steps beside the plan and none.
+    assert json.loads(capsys.readouterr().out)["control_steps"] == 53 + 4
+    assert replayed == [(53 + 4) * 32] * 2
+
+
 def test_a_plan_is_timed_beside_the_control_steps_it_took(
     capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -54,7 +54,7 @@ def run(overrides: Sequence[str], rounds: int) -> dict[str, Any]:
     env.reset()
     planner = build_planner(copies, actor, critic, settings)
     base, physics = env.base_env, copies.base_env.physics
-    recorder, replay = StepRecorder(physics), RawReplay(physics)
+    recorder, replay = StepRecorder(physics, in_turns=False), RawReplay(physics)
 
     frames = -(-30 // settings.every) * settings.every  # a second's, in whole plans
     planned, bare, ratios, cpu_ratios = [], [], [], []

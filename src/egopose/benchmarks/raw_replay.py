@@ -17,9 +17,16 @@ from egopose.humanoid.physics import STATE, Array, BatchedPhysics
 
 @dataclass
 class StepRecorder:
-    """Keeps the states and controls of every control step a physics takes while it is switched on."""
+    """Keeps the states and controls of every control step a physics takes while it is switched on.
+
+    Args:
+        physics: whose steps are kept.
+        in_turns: whether ranges of worlds take turns, in order: a step is then one of all worlds. Else each range's is
+            a step.
+    """
 
     physics: BatchedPhysics
+    in_turns: bool = True
     states: list[Array] = field(default_factory=list)
     ctrls: list[Array] = field(default_factory=list)
 
@@ -29,8 +36,7 @@ class StepRecorder:
 
         def recorded(ctrl: Array, worlds: slice) -> Any:
             parts.append((self.physics.state[worlds].copy(), ctrl.copy()))
-            # Ranges of worlds take turns, in order.
-            if sum(len(part) for _, part in parts) == self.physics.num_envs:
+            if not self.in_turns or sum(len(part) for _, part in parts) == self.physics.num_envs:
                 for record, columns in zip((self.states, self.ctrls), zip(*parts, strict=True), strict=True):
                     record.append(np.concatenate(columns))
                 parts.clear()
@@ -54,7 +60,8 @@ class RawReplay:
     def __init__(self, physics: BatchedPhysics) -> None:
         self._model, self._substeps = physics.model, physics.substeps
         self._warm_starts = np.zeros((physics.num_envs, physics.model.nv))
-        self._shares = [list(part) for part in np.array_split(np.arange(physics.num_envs), physics.threads)]
+        # Every thread has its part of the first worlds too: some steps are of those alone.
+        self._shares = [range(first, physics.num_envs, physics.threads) for first in range(physics.threads)]
         self._pool = ThreadPoolExecutor(physics.threads)
 
     def run(self, states: list[Array], ctrls: list[Array]) -> float:
@@ -63,12 +70,12 @@ class RawReplay:
         list(self._pool.map(lambda share: self._run_share(share, states, ctrls), self._shares))
         return time.perf_counter() - start
 
-    def _run_share(self, worlds: list[int], states: list[Array], ctrls: list[Array]) -> None:
+    def _run_share(self, worlds: range, states: list[Array], ctrls: list[Array]) -> None:
         model, substeps = self._model, self._substeps
         data = mujoco.MjData(model)
         held, warm = data.ctrl, data.qacc_warmstart
         for state, ctrl in zip(states, ctrls, strict=True):
-            for i in worlds:
+            for i in range(worlds.start, len(state), worlds.step):
                 mujoco.mj_setState(model, data, state[i], STATE)
                 held[:], warm[:] = ctrl[i], self._warm_starts[i]
                 mujoco.mj_step(model, data, substeps)
