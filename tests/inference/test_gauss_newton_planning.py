@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-from functools import cache
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from helpers.env_stand_in import build_problem, environment, group
-from helpers.humanoid_stand_in import reference_motion, stand_in
+from helpers import two_takes
+from helpers.two_takes import critic, humanoid, passive
 from scipy.spatial.transform import Rotation
-from tensordict.nn import TensorDictModule
-from torchrl.envs import Compose, TransformedEnv
 
 from egopose.core.config import compose_config
 from egopose.core.errors import InputError
@@ -20,53 +17,25 @@ from egopose.envs.env import EgoPoseEnv
 from egopose.envs.mdp.observations import humanoid_state
 from egopose.envs.mdp.path import root_on_floor
 from egopose.envs.problem import Followed, global_frame
-from egopose.envs.starts import Piece
-from egopose.envs.transforms import StateNormalizer
 from egopose.inference.estimator import Estimate, estimate_takes
 from egopose.inference.failsafe import FailSafe, FailSafeSettings
 from egopose.inference.gauss_newton_planner import GaussNewtonPlanner, GaussNewtonSettings
 from egopose.inference.planners import build_planner, read_planner
 
 FRAMES = 24
-PIECES = (Piece(0, 0, FRAMES), Piece(1, 0, FRAMES))
-humanoid = cache(stand_in)
-HINGES = stand_in().mj_model.nu
+HINGES = humanoid().mj_model.nu
 SMALL = {"samples": 1 + HINGES, "horizon": 8, "changed": 3, "every": 3, "recovery_rounds": 0}
-
-
-@cache
-def true_motion() -> Any:
-    return reference_motion(humanoid(), (FRAMES, FRAMES))
-
-
-def make_env(num_envs: int) -> TransformedEnv:
-    reference, takes = true_motion()
-    task = group("task", "estimation")
-    task = task | {"termination": {"enabled": False, "head_drop": 0.1}}
-    problem = build_problem(humanoid(), reference, takes, task, group("reward", "estimation"))
-    base = environment(num_envs, problem=problem, fragments=PIECES, whole_fragments=True)
-    env = TransformedEnv(base, Compose(StateNormalizer(base.observation_spec["humanoid_state"].shape[-1])))
-    env.transform[0].freeze()
-    return env
 
 
 def leaning() -> EgoPoseEnv:
     """Two bodies some frames after their start, not where the reference has them."""
-    env = make_env(2)
+    env = two_takes.make_env(2, FRAMES)
     env.reset()
     base = env.base_env
     assert isinstance(base, EgoPoseEnv)
     for _ in range(3):
         base.try_step(0.2 * torch.randn(2, HINGES, generator=torch.Generator().manual_seed(1)))
     return base
-
-
-def passive() -> TensorDictModule:
-    return TensorDictModule(lambda z: torch.zeros(len(z), HINGES), in_keys=["humanoid_state"], out_keys=["action"])
-
-
-def critic() -> TensorDictModule:
-    return TensorDictModule(lambda z: 2.0 + z[:, :1], in_keys=["humanoid_state"], out_keys=["state_value"])
 
 
 def settings(**changed: Any) -> GaussNewtonSettings:
@@ -77,22 +46,24 @@ def settings(**changed: Any) -> GaussNewtonSettings:
 
 
 def planner_for(num_envs: int, **changed: Any) -> GaussNewtonPlanner:
-    reference, chosen = true_motion()[0], settings(**changed)
+    reference, chosen = two_takes.true_motion(FRAMES)[0], settings(**changed)
     followed = Followed(humanoid_state(reference).float(), global_frame, root_on_floor(reference["qpos"]))
-    planner = build_planner(make_env(num_envs * chosen.samples), passive(), critic(), chosen, followed)
+    planner = build_planner(
+        two_takes.make_env(num_envs * chosen.samples, FRAMES), passive(), critic(), chosen, followed
+    )
     assert isinstance(planner, GaussNewtonPlanner)
     return planner
 
 
 def run(planner: GaussNewtonPlanner | None) -> list[Estimate]:
-    guard = FailSafe(len(PIECES), FailSafeSettings("off", reset_threshold=0.6, fallen_height=0.3))
-    states = humanoid_state(true_motion()[0]).float()
-    return estimate_takes(make_env(len(PIECES)), passive(), critic(), states, guard, planner=planner)
+    guard = FailSafe(2, FailSafeSettings("off", reset_threshold=0.6, fallen_height=0.3))
+    states = humanoid_state(two_takes.true_motion(FRAMES)[0]).float()
+    return estimate_takes(two_takes.make_env(2, FRAMES), passive(), critic(), states, guard, planner=planner)
 
 
 def test_a_body_comes_nearer_to_what_it_follows() -> None:
     alone, ahead = run(None), run(planner_for(2))
-    reference = true_motion()[0]["qpos"].reshape(2, FRAMES, -1).numpy()
+    reference = two_takes.true_motion(FRAMES)[0]["qpos"].reshape(2, FRAMES, -1).numpy()
     for one, other, true in zip(alone, ahead, reference, strict=True):
         np.testing.assert_array_equal(one.qpos[0], other.qpos[0])
         away = [np.abs(motion.qpos[:, 2:] - true[:, 2:]).mean() for motion in (one, other)]
@@ -112,7 +83,7 @@ def test_the_target_itself_costs_offsets_alone_wherever_its_path_is_laid() -> No
     offset.path = planner.path
     futures = planner._simulated(base.state_dict(), torch.zeros(1, 2, steps, HINGES))
     assert futures is not None
-    wanted = true_motion()[0]["qpos"].numpy()[futures.row.numpy()]
+    wanted = two_takes.true_motion(FRAMES)[0]["qpos"].numpy()[futures.row.numpy()]
     place, heading = (part.numpy() for part in planner.path.at(futures.row))
     turns = heading - root_on_floor(torch.from_numpy(wanted))[:, 2].numpy()
     upright = Rotation.from_rotvec(np.outer(turns, [0.0, 0.0, 1.0]))
@@ -184,6 +155,8 @@ def test_samples_that_are_not_one_for_each_knot_are_refused() -> None:
 
 
 def test_a_target_motion_without_a_path_is_refused() -> None:
-    states, chosen = humanoid_state(true_motion()[0]).float(), settings()
+    states, chosen = humanoid_state(two_takes.true_motion(FRAMES)[0]).float(), settings()
     with pytest.raises(InputError, match="planner=ahead"):
-        build_planner(make_env(chosen.samples), passive(), critic(), chosen, Followed(states, global_frame))
+        build_planner(
+            two_takes.make_env(chosen.samples, FRAMES), passive(), critic(), chosen, Followed(states, global_frame)
+        )

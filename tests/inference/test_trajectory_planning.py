@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-from functools import cache
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from helpers.env_stand_in import build_problem, environment, group
-from helpers.humanoid_stand_in import reference_motion, stand_in
-from tensordict.nn import TensorDictModule
-from torchrl.envs import Compose, TransformedEnv
+from helpers import two_takes
+from helpers.two_takes import critic, passive
 
 from egopose.core.config import compose_config
 from egopose.core.errors import InputError
@@ -19,40 +16,11 @@ from egopose.envs.env import EgoPoseEnv
 from egopose.envs.mdp.observations import humanoid_state
 from egopose.envs.mdp.path import root_on_floor
 from egopose.envs.problem import Followed, global_frame
-from egopose.envs.starts import Piece
-from egopose.envs.transforms import StateNormalizer
 from egopose.inference.estimator import Estimate, estimate_takes
 from egopose.inference.failsafe import FailSafe, FailSafeSettings
 from egopose.inference.planners import TrajectoryPlanner, TrajectoryPlannerSettings, build_planner, read_planner
 
 FRAMES = 40
-PIECES = (Piece(0, 0, FRAMES), Piece(1, 0, FRAMES))
-humanoid = cache(stand_in)
-
-
-@cache
-def true_motion() -> Any:
-    return reference_motion(humanoid(), (FRAMES, FRAMES))
-
-
-def make_env(num_envs: int) -> TransformedEnv:
-    reference, takes = true_motion()
-    task = group("task", "estimation")
-    task = task | {"termination": {"enabled": False, "head_drop": 0.1}}
-    problem = build_problem(humanoid(), reference, takes, task, group("reward", "estimation"))
-    base = environment(num_envs, problem=problem, fragments=PIECES, whole_fragments=True)
-    env = TransformedEnv(base, Compose(StateNormalizer(base.observation_spec["humanoid_state"].shape[-1])))
-    env.transform[0].freeze()
-    return env
-
-
-def passive() -> TensorDictModule:
-    size = humanoid().mj_model.nu
-    return TensorDictModule(lambda z: torch.zeros(len(z), size), in_keys=["humanoid_state"], out_keys=["action"])
-
-
-def critic() -> TensorDictModule:
-    return TensorDictModule(lambda z: 2.0 + z[:, :1], in_keys=["humanoid_state"], out_keys=["state_value"])
 
 
 def settings(**changed: Any) -> TrajectoryPlannerSettings:
@@ -63,25 +31,25 @@ def settings(**changed: Any) -> TrajectoryPlannerSettings:
 
 
 def planner_for(num_envs: int, **changed: Any) -> TrajectoryPlanner:
-    reference, _ = true_motion()
+    reference, _ = two_takes.true_motion(FRAMES)
     states = humanoid_state(reference).float()
     followed = Followed(states, global_frame, root_on_floor(reference["qpos"]))
-    planner = build_planner(make_env(num_envs), passive(), critic(), settings(**changed), followed)
+    planner = build_planner(two_takes.make_env(num_envs, FRAMES), passive(), critic(), settings(**changed), followed)
     assert isinstance(planner, TrajectoryPlanner)
     return planner
 
 
 def run(planner: TrajectoryPlanner | None) -> list[Estimate]:
-    guard = FailSafe(len(PIECES), FailSafeSettings("off", reset_threshold=0.6, fallen_height=0.3))
-    states = humanoid_state(true_motion()[0]).float()
-    return estimate_takes(make_env(len(PIECES)), passive(), critic(), states, guard, planner=planner)
+    guard = FailSafe(2, FailSafeSettings("off", reset_threshold=0.6, fallen_height=0.3))
+    states = humanoid_state(two_takes.true_motion(FRAMES)[0]).float()
+    return estimate_takes(two_takes.make_env(2, FRAMES), passive(), critic(), states, guard, planner=planner)
 
 
 def test_a_body_stays_nearer_to_what_it_follows() -> None:
     """Where the pose weighs more than the controls; without a plan both bodies fall earlier."""
     cost = compose_config("evaluate", ["checkpoint=none", "planner=trajectory"])["planner"]["cost"]
     alone, ahead = run(None), run(planner_for(2, cost={**cost, "control": 1.0, "joints": 5.0}))
-    reference = true_motion()[0]["qpos"].reshape(2, FRAMES, -1).numpy()
+    reference = two_takes.true_motion(FRAMES)[0]["qpos"].reshape(2, FRAMES, -1).numpy()
     for one, other, true in zip(alone, ahead, reference, strict=True):
         np.testing.assert_array_equal(one.qpos[0], other.qpos[0])
         away = [np.abs(motion.qpos[:, 2:] - true[:, 2:]).mean() for motion in (one, other)]
@@ -92,7 +60,7 @@ def test_a_body_stays_nearer_to_what_it_follows() -> None:
 
 
 def test_between_plans_gains_answer_what_differs_from_the_plan() -> None:
-    planner, env = planner_for(2), make_env(2)
+    planner, env = planner_for(2), two_takes.make_env(2, FRAMES)
     env.reset()
     base = env.base_env
     assert isinstance(base, EgoPoseEnv)
@@ -110,7 +78,7 @@ def test_between_plans_gains_answer_what_differs_from_the_plan() -> None:
 
 
 def test_a_body_put_elsewhere_is_planned_for_anew() -> None:
-    planner, env = planner_for(2, every=8), make_env(2)
+    planner, env = planner_for(2, every=8), two_takes.make_env(2, FRAMES)
     env.reset()
     base = env.base_env
     assert isinstance(base, EgoPoseEnv)
@@ -124,7 +92,7 @@ def test_a_body_put_elsewhere_is_planned_for_anew() -> None:
 
 
 def test_nothing_of_the_planned_bodies_is_touched() -> None:
-    planner, env = planner_for(2), make_env(2)
+    planner, env = planner_for(2), two_takes.make_env(2, FRAMES)
     env.reset()
     base = env.base_env
     assert isinstance(base, EgoPoseEnv)
@@ -142,6 +110,6 @@ def test_settings_out_of_range_are_refused(name: str, value: float) -> None:
 
 
 def test_a_target_motion_without_a_path_is_refused() -> None:
-    states = humanoid_state(true_motion()[0]).float()
+    states = humanoid_state(two_takes.true_motion(FRAMES)[0]).float()
     with pytest.raises(InputError, match="planner=ahead"):
-        build_planner(make_env(1), passive(), critic(), settings(), Followed(states, global_frame))
+        build_planner(two_takes.make_env(1, FRAMES), passive(), critic(), settings(), Followed(states, global_frame))
