@@ -10,10 +10,11 @@ from egopose.core.errors import InputError
 from egopose.inference.gauss_newton import (
     Distance,
     DistanceWeights,
-    check_dampings,
+    check_steps,
     damped_steps,
     knot_lines,
     single_changes,
+    steps_of,
 )
 
 BODIES = 12
@@ -51,6 +52,18 @@ def test_a_step_is_the_damped_least_squares(damping: float) -> None:
     np.testing.assert_allclose(short, np.clip(wanted, -0.01, 0.01))
 
 
+def test_what_broke_has_no_slope_and_a_broken_window_no_step() -> None:
+    rng = np.random.default_rng(3)
+    base, slopes, sound = rng.normal(size=9), rng.normal(size=(4, 9)), np.array([True, True, False, True, True])
+    tried = np.concatenate([base[None], base + 0.1 * slopes])
+    tried[2] = np.nan
+    wanted = damped_steps(np.delete(slopes, 1, axis=0), base, [2.0], 10.0)
+    found = steps_of(tried, sound, 0.1, [2.0], 10.0)
+    np.testing.assert_allclose(np.delete(found, 1, axis=1), wanted, atol=1e-9)
+    assert found[0, 1] == pytest.approx(0.0, abs=1e-12)
+    assert not steps_of(tried, np.zeros(5, dtype=bool), 0.1, [2.0], 10.0).any()
+
+
 def test_a_distance_has_each_weight_once() -> None:
     humanoid = stand_in()
     rng, model = np.random.default_rng(1), humanoid.mj_model
@@ -80,4 +93,4 @@ def test_a_distance_has_each_weight_once() -> None:
 @pytest.mark.parametrize("dampings", [(), (1.0, 0.0), (-1.0,)])
 def test_dampings_that_cannot_be_are_named(dampings: tuple[float, ...]) -> None:
     with pytest.raises(InputError, match="dampings"):
-        check_dampings("planner", dampings)
+        check_steps("planner", 0.1, 0.1, dampings)

@@ -12,6 +12,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from egopose.core.errors import InputError
 from egopose.humanoid.derivatives import state_difference
@@ -106,7 +107,27 @@ def damped_steps(slopes: Array, residuals: Array, dampings: Sequence[float], rea
     return np.clip(np.stack(steps), -reach, reach)
 
 
-def check_dampings(source: str, dampings: Sequence[float]) -> None:
-    """Raises InputError: there is none, or one is not positive."""
+def steps_of(
+    residuals: Array, sound: NDArray[np.bool_], difference: float, dampings: Sequence[float], reach: float
+) -> Array:
+    """``[D, P]``: :func:`damped_steps` by what came of each parameter alone; none where the window itself broke.
+
+    Args:
+        residuals: ``[1 + P, R]`` of the window as it is, and with each parameter ``difference`` larger.
+        sound: ``[1 + P]`` whose physics did not break.
+        difference: see ``residuals``.
+        dampings, reach: see :func:`damped_steps`.
+    """
+    if not sound[0]:
+        return np.zeros((len(dampings), len(residuals) - 1))
+    slopes = np.where(sound[1:, None], residuals[1:] - residuals[0], 0.0) / difference
+    return damped_steps(slopes, residuals[0], dampings, reach)
+
+
+def check_steps(source: str, difference: float, reach: float, dampings: Sequence[float]) -> None:
+    """Raises InputError: a value is not positive, or there is no damping."""
+    for name, value in (("difference", difference), ("reach", reach)):
+        if not value > 0:
+            raise InputError(source, name, "must be positive, rad")
     if not dampings or min(dampings) <= 0:
         raise InputError(source, "dampings", "must be positive numbers, at least one")

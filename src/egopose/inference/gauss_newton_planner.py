@@ -27,14 +27,13 @@ from egopose.inference.candidates import Futures, Tried
 from egopose.inference.gauss_newton import (
     Distance,
     DistanceWeights,
-    check_dampings,
-    damped_steps,
+    check_steps,
     knot_lines,
     single_changes,
+    steps_of,
 )
 from egopose.inference.planner import Planner
 from egopose.inference.planner_settings import PlannerSettings
-from egopose.models.pose_regression import state_to_qpos
 from egopose.motion import rotations as rot
 from egopose.motion.rotations import Array
 
@@ -90,10 +89,7 @@ class GaussNewtonSettings(PlannerSettings):
             raise InputError("planner", "iterations", "must be at least 1")
         if not 1 <= self.changed <= self.horizon:
             raise InputError("planner", "changed", "must lie between 1 and the horizon")
-        for name in ("difference", "reach"):
-            if not getattr(self, name) > 0:
-                raise InputError("planner", name, "must be positive, rad")
-        check_dampings("planner", self.dampings)
+        check_steps("planner", self.difference, self.reach, self.dampings)
 
     @classmethod
     def from_config(cls, values: Mapping[str, Any]) -> GaussNewtonSettings:
@@ -146,13 +142,6 @@ class GaussNewtonPlanner(Planner):
         super().forget(worlds)
         self._taken[worlds] = 0.0
 
-    def follow(self, states: Tensor) -> None:
-        super().follow(states)
-        joint_range = self._base.problem.humanoid.joint_range
-        facing = np.array([1.0, 0.0, 0.0, 0.0])
-        self._qpos, self._qvel = state_to_qpos(states.double().numpy(), np.zeros(2), facing, joint_range)
-        self._places: Array = self._base.physics.poses(self._qpos)["xpos"]
-
     def _searched(self, now: Mapping[str, Tensor]) -> Tried | None:
         settings, tried = self.settings, None
         plan = self._plan[:, : settings.horizon].clone()
@@ -180,11 +169,10 @@ class GaussNewtonPlanner(Planner):
         sound = (futures.broken.view(candidates.shape[:2]) == 0).numpy()
         steps = np.zeros((len(settings.dampings), worlds, *self._lines.shape[:1], candidates.shape[-1]))
         for world in range(worlds):
-            own = residuals[:, world]
-            if sound[0, world]:
-                slopes = np.where(sound[1:, world, None], own[1:] - own[0], 0.0) / settings.difference
-                step = damped_steps(slopes, own[0], settings.dampings, settings.reach)
-                steps[:, world] = step.reshape(len(step), *steps.shape[2:])
+            step = steps_of(
+                residuals[:, world], sound[:, world], settings.difference, settings.dampings, settings.reach
+            )
+            steps[:, world] = step.reshape(len(step), *steps.shape[2:])
         return torch.einsum("kl,dnkj->dnlj", self._lines, torch.from_numpy(steps).float())
 
     def _residuals(self, futures: Futures, candidates: Tensor) -> Array:

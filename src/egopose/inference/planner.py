@@ -123,7 +123,9 @@ class Planner:
         it.
         """
         humanoid, facing = self._base.problem.humanoid, np.array([1.0, 0.0, 0.0, 0.0])
-        body = self._base.bodies(*state_to_qpos(states.double().numpy(), np.zeros(2), facing, humanoid.joint_range))
+        self._qpos, self._qvel = state_to_qpos(states.double().numpy(), np.zeros(2), facing, humanoid.joint_range)
+        body = self._base.bodies(self._qpos, self._qvel)
+        self._places: Array = body.xpos.numpy()
         self._followed = {name: getattr(body, name) for name in self._reward.reads}
         self._head_height = body.xpos[:, humanoid.head, 2]
 

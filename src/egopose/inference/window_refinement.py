@@ -23,10 +23,10 @@ from egopose.humanoid.physics import BatchedPhysics
 from egopose.inference.gauss_newton import (
     Distance,
     DistanceWeights,
-    check_dampings,
-    damped_steps,
+    check_steps,
     knot_lines,
     single_changes,
+    steps_of,
 )
 from egopose.inference.reference_tracker import ReferenceTracker
 from egopose.motion.rotations import Array
@@ -87,10 +87,7 @@ class RefinementSettings:
         for name, most in (("changed", "window"), ("advance", "changed")):
             if getattr(self, name) > getattr(self, most):
                 raise InputError("refinement", name, f"{getattr(self, name)} frames are more than {most}")
-        for name in ("difference", "reach"):
-            if not getattr(self, name) > 0:
-                raise InputError("refinement", name, "must be positive, rad")
-        check_dampings("refinement", self.dampings)
+        check_steps("refinement", self.difference, self.reach, self.dampings)
 
     @classmethod
     def from_config(cls, values: Mapping[str, Any], source: str = "conf/reconstruct.yaml") -> RefinementSettings:
@@ -216,7 +213,9 @@ class WindowRefiner:
         best = None
         for _ in range(settings.iterations):
             tried = self._simulate(first, qpos, qvel, offsets + alone, before)
-            steps = _steps(tried, settings).reshape(len(settings.dampings), len(shape), self._nu)
+            steps = steps_of(
+                tried.residuals, np.isfinite(tried.cost), settings.difference, settings.dampings, settings.reach
+            ).reshape(len(settings.dampings), len(shape), self._nu)
             changed = offsets + np.einsum("kl,nkj->nlj", shape, steps)
             changed = np.concatenate([offsets[None], changed])
             found = self._simulate(first, qpos, qvel, changed, before)
@@ -270,15 +269,6 @@ class WindowRefiner:
         places = self._distance.of_bodies(self._physics.poses(qpos)["xpos"], self._places[frame])
         change = self._distance.of_change((qvel - before) - (reference.qvel[frame] - reference.qvel[frame - 1]))
         return np.concatenate([trust * state, trust * places, change], axis=1)
-
-
-def _steps(tried: _Futures, settings: RefinementSettings) -> Array:
-    """``[dampings, knots * nu]`` rad: Gauss-Newton's steps; the first of ``tried`` is the window as it is."""
-    if not np.isfinite(tried.cost[0]):
-        return np.zeros((len(settings.dampings), len(tried.cost) - 1))
-    sound = np.isfinite(tried.cost[1:])[:, None]
-    slopes = np.where(sound, tried.residuals[1:] - tried.residuals[0], 0.0) / settings.difference
-    return damped_steps(slopes, tried.residuals[0], settings.dampings, settings.reach)
 
 
 def _only(futures: _Futures, world: int) -> _Futures:
